@@ -1,0 +1,1 @@
+"""Differentiable volume rendering of tetrahedral meshes."""

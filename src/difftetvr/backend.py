@@ -1,0 +1,157 @@
+"""Dr.Jit back ends: which one runs, its array types, and zero-copy exchange with PyTorch.
+
+The kernels are plain Python functions over the array types of a :class:`Backend`; one source runs on LLVM (CPUs), CUDA
+and Metal, in float32 and float64. Only kernel modules and the modules that wrap them use this file.
+"""
+
+from __future__ import annotations
+
+import importlib
+import platform
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import drjit as dr
+import torch
+
+from difftetvr.errors import BackendError
+
+_DEVICE_BACKENDS = {"cpu": "llvm", "cuda": "cuda", "mps": "metal"}
+_DTYPES = {torch.float32: "", torch.float64: "64"}
+
+
+@dataclass(frozen=True)
+class Backend:
+    """The Dr.Jit array types of one back end at one floating-point precision.
+
+    Attributes:
+        name: ``"llvm"``, ``"cuda"`` or ``"metal"``.
+        device: PyTorch device whose memory the arrays share.
+        dtype: ``torch.float32`` or ``torch.float64``.
+        Float: Dr.Jit floating-point array of that precision.
+        UInt: Dr.Jit 32-bit unsigned array.
+        Int: Dr.Jit 32-bit signed array.
+        Bool: Dr.Jit mask array.
+        Float2: Vector of two ``Float``, gathered as one packet.
+        Float4: Vector of four ``Float``, gathered as one packet.
+        UInt2: Vector of two ``UInt``, gathered as one packet.
+    """
+
+    name: str
+    device: torch.device
+    dtype: torch.dtype
+    Float: Any
+    UInt: Any
+    Int: Any
+    Bool: Any
+    Float2: Any
+    Float4: Any
+    UInt2: Any
+
+    @property
+    def is_double(self) -> bool:
+        """Whether the kernels run in float64."""
+        return self.dtype == torch.float64
+
+    def floats(self, tensor: torch.Tensor) -> Any:
+        """Flat Dr.Jit view of a floating-point tensor, without a copy if it is contiguous and of this precision."""
+        return self.Float(tensor.detach().to(self.dtype).contiguous().reshape(-1))
+
+    def uints(self, tensor: torch.Tensor) -> Any:
+        """Flat Dr.Jit view of an int32 tensor as unsigned integers: -1 becomes 0xFFFFFFFF."""
+        return self.UInt(tensor.detach().to(torch.int32).contiguous().reshape(-1).view(torch.uint32))
+
+    def opaque(self, value: float) -> Any:
+        """A scalar as a device value, so that kernels need no recompilation when it changes."""
+        return dr.opaque(self.Float, float(value))
+
+    def opaque_uint(self, value: int) -> Any:
+        """An integer as a device value, so that kernels need no recompilation when it changes."""
+        return dr.opaque(self.UInt, int(value))
+
+    def tensor(self, array: Any, *shape: int) -> torch.Tensor:
+        """PyTorch tensor over a Dr.Jit array's memory, without a copy."""
+        dr.eval(array)
+        dr.sync_thread()
+        tensor = array.torch()
+        return tensor.reshape(shape) if shape else tensor
+
+
+def backend_for(tensor: torch.Tensor) -> Backend:
+    """Back end that works on a tensor's device at its precision.
+
+    Raises:
+        BackendError: The device has no Dr.Jit back end, or its back end cannot start on this machine.
+    """
+    return get_backend(str(tensor.device), tensor.dtype)
+
+
+@cache
+def get_backend(device: str = "cpu", dtype: torch.dtype = torch.float32) -> Backend:
+    """Back end for a device name (``"cpu"``, ``"cuda"``, ``"mps"``) and a precision.
+
+    Raises:
+        BackendError: The device has no Dr.Jit back end, or its back end cannot start on this machine.
+    """
+    torch_device = torch.device(device)
+    name = _DEVICE_BACKENDS.get(torch_device.type)
+    if name is None:
+        raise BackendError(f"Device '{device}' has no Dr.Jit back end; move the tensors to 'cpu', 'cuda' or 'mps'.")
+    if dtype not in _DTYPES or (name == "metal" and dtype == torch.float64):
+        raise BackendError(f"The {name} kernels cannot run in {dtype}; convert the tensors to torch.float32.")
+    if not dr.has_backend(getattr(dr.JitBackend, {"llvm": "LLVM", "cuda": "CUDA", "metal": "Metal"}[name])):
+        raise BackendError(_missing_backend(name))
+    types = importlib.import_module(f"drjit.{name}")
+    suffix = _DTYPES[dtype]
+    return Backend(
+        name=name,
+        device=torch_device,
+        dtype=dtype,
+        Float=getattr(types, f"Float{suffix}"),
+        UInt=types.UInt32,
+        Int=types.Int32,
+        Bool=types.Bool,
+        Float2=getattr(types, f"Array2f{suffix}"),
+        Float4=getattr(types, f"Array4f{suffix}"),
+        UInt2=types.Array2u,
+    )
+
+
+def default_device() -> torch.device:
+    """The fastest device whose back end works: CUDA, then Metal, then the CPU.
+
+    Raises:
+        BackendError: None works.
+    """
+    for device in ("cuda", "mps", "cpu"):
+        available = {"cuda": torch.cuda.is_available, "mps": torch.backends.mps.is_available}.get(device, lambda: True)
+        try:
+            if available():
+                get_backend(device)
+                return torch.device(device)
+        except BackendError:
+            continue
+    raise BackendError(_missing_backend("llvm"))
+
+
+def _missing_backend(name: str) -> str:
+    if name == "cuda":
+        return "The CUDA back end cannot start: update the NVIDIA driver, or move the tensors to the CPU."
+    if name == "metal":
+        return "The Metal back end cannot start on this system; move the tensors to the CPU."
+    return f"The CPU back end needs a system libLLVM of version 15 or newer and found none: run `{_llvm_command()}`."
+
+
+def _llvm_command() -> str:
+    if platform.system() == "Darwin":
+        return "brew install llvm"
+    if platform.system() == "Windows":
+        return "conda install -c conda-forge llvmdev"
+    release = platform.freedesktop_os_release() if hasattr(platform, "freedesktop_os_release") else {}
+    family = f"{release.get('ID', '')} {release.get('ID_LIKE', '')}"
+    if "debian" in family or "ubuntu" in family:
+        return "sudo apt-get install libllvm15"
+    if "fedora" in family or "rhel" in family:
+        return "sudo dnf install llvm-libs"
+    return "conda install -c conda-forge llvmdev"

@@ -1,0 +1,23 @@
+"""Every error a user can cause: one sentence that says what is wrong, where, and what to do."""
+
+from __future__ import annotations
+
+
+class DiffTetError(Exception):
+    """Base of all errors raised for bad input; the command line prints its sentence and exits with code 2."""
+
+
+class MeshError(DiffTetError):
+    """A tetrahedral mesh or the field on it is invalid, or a mesh file cannot be read or written."""
+
+
+class CaptureError(DiffTetError):
+    """Images, cameras, volumes or transfer functions that a reconstruction starts from are invalid."""
+
+
+class CameraError(DiffTetError):
+    """A camera's pose, intrinsics or image size is invalid."""
+
+
+class BackendError(DiffTetError):
+    """No Dr.Jit back end can run the kernels on this machine or on the device of the given tensors."""

@@ -1,0 +1,139 @@
+"""Pinhole cameras in OpenCV axes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+
+from difftetvr.errors import CameraError
+
+_ORTHONORMALITY_TOLERANCE = 1e-3
+
+Vector = Sequence[float] | torch.Tensor
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera; +x points right, +y down and +z forward (OpenCV axes).
+
+    The ray of pixel (i, j), column i and row j, goes through its centre (i + 0.5, j + 0.5).
+
+    Attributes:
+        world_to_camera: (4, 4) rigid transform, the extrinsics. Images are differentiable in it.
+        fx: Focal length in pixels along x, > 0.
+        fy: Focal length in pixels along y, > 0.
+        cx: Principal point in pixels along x.
+        cy: Principal point in pixels along y.
+        width: Image width in pixels.
+        height: Image height in pixels.
+
+    Raises:
+        CameraError: A value is out of range, or the extrinsics are no rigid transform.
+    """
+
+    world_to_camera: torch.Tensor
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        pose = torch.as_tensor(self.world_to_camera)
+        if not pose.is_floating_point():
+            pose = pose.to(torch.float32)
+        object.__setattr__(self, "world_to_camera", pose)
+        if pose.shape != (4, 4):
+            raise CameraError(f"world_to_camera has shape {tuple(pose.shape)}; give a (4, 4) matrix.")
+        if not all(math.isfinite(v) for v in (self.fx, self.fy, self.cx, self.cy)):
+            raise CameraError("A focal length or principal point is not finite; give finite pixel values.")
+        if self.fx <= 0 or self.fy <= 0:
+            raise CameraError(f"Focal lengths are ({self.fx}, {self.fy}) pixels; both must be greater than 0.")
+        if self.width < 1 or self.height < 1:
+            raise CameraError(f"The image size is {self.width} x {self.height} pixels; both must be at least 1.")
+        values = pose.detach().to("cpu", torch.float64)
+        if not bool(torch.isfinite(values).all()):
+            raise CameraError("world_to_camera holds a value that is not finite; give a rigid transform.")
+        rotation = values[:3, :3]
+        deviation = (rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max().item()
+        last_row = (values[3] - torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)).abs().max().item()
+        if max(deviation, last_row) > _ORTHONORMALITY_TOLERANCE or torch.linalg.det(rotation) < 0:
+            raise CameraError(
+                "world_to_camera is no rigid transform (rotation without scale or mirror, last row 0 0 0 1); "
+                "orthonormalise it first."
+            )
+
+    @staticmethod
+    def look_at(
+        eye: Vector, target: Vector, up: Vector = (0.0, 0.0, 1.0), fov_y: float = 0.927, width: int = 512, height: int = 512
+    ) -> Camera:
+        """Camera at ``eye`` that looks at ``target``, with square pixels and a centred principal point.
+
+        Args:
+            eye: (3,) position in world space.
+            target: (3,) point that projects to the image centre.
+            up: (3,) direction that projects to the image's upward direction.
+            fov_y: Vertical field of view in radians, in (0, pi).
+            width: Image width in pixels.
+            height: Image height in pixels.
+
+        Raises:
+            CameraError: The points coincide, ``up`` is parallel to the view, or a value is out of range.
+        """
+        if not 0.0 < fov_y < math.pi:
+            raise CameraError(f"fov_y is {fov_y} radians; it must lie between 0 and pi.")
+        origin, center, upward = (torch.as_tensor(v, dtype=torch.float64).reshape(-1) for v in (eye, target, up))
+        if any(v.numel() != 3 for v in (origin, center, upward)):
+            raise CameraError("eye, target and up must each have three components.")
+        forward = center - origin
+        right = torch.linalg.cross(forward, upward)
+        if not right.norm() > 1e-9 * forward.norm() * upward.norm():
+            raise CameraError("eye and target coincide, or up is parallel to the view; choose another up vector.")
+        forward, right = forward / forward.norm(), right / right.norm()
+        rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[:3, :3] = rotation
+        pose[:3, 3] = -rotation @ origin
+        focal = 0.5 * height / math.tan(0.5 * fov_y)
+        return Camera(pose.to(torch.float32), focal, focal, 0.5 * width, 0.5 * height, width, height)
+
+    @property
+    def position(self) -> torch.Tensor:
+        """(3,) position of the camera in world space."""
+        return -self.world_to_camera[:3, :3].T @ self.world_to_camera[:3, 3]
+
+    @property
+    def camera_to_world(self) -> torch.Tensor:
+        """(4, 4) inverse of the extrinsics."""
+        pose = torch.eye(4, dtype=self.world_to_camera.dtype, device=self.world_to_camera.device)
+        pose[:3, :3] = self.world_to_camera[:3, :3].T
+        pose[:3, 3] = self.position
+        return pose
+
+    def to_camera_space(self, points: torch.Tensor) -> torch.Tensor:
+        """(N, 3) world-space points in camera space; differentiable in the points and the extrinsics."""
+        pose = self.world_to_camera.to(points)
+        return points @ pose[:3, :3].T + pose[:3, 3]
+
+    def ray_directions(self) -> torch.Tensor:
+        """(H, W, 3) unit directions of the pixels' rays in camera space, float64."""
+        x = (torch.arange(self.width, dtype=torch.float64) + 0.5 - self.cx) / self.fx
+        y = (torch.arange(self.height, dtype=torch.float64) + 0.5 - self.cy) / self.fy
+        rows, columns = torch.meshgrid(y, x, indexing="ij")
+        directions = torch.stack([columns, rows, torch.ones_like(rows)], dim=-1)
+        return directions / directions.norm(dim=-1, keepdim=True)
+
+    def with_size(self, width: int, height: int) -> Camera:
+        """The same view at another resolution."""
+        sx, sy = width / self.width, height / self.height
+        return replace(
+            self, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy, width=width, height=height
+        )
+
+    def with_pose(self, world_to_camera: torch.Tensor) -> Camera:
+        """The same intrinsics with other extrinsics."""
+        return replace(self, world_to_camera=world_to_camera)
