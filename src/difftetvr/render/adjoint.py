@@ -1,0 +1,253 @@
+"""The adjoint of the marching renderer (Dr.Jit kernel).
+
+It walks the same cells again, front to back. ``rest`` is the part of <dL/dimage, image> still ahead of the ray, so the
+derivative with respect to a cell's optical depth needs nothing from behind it (the inversion trick of Weiss and
+Westermann without its division). Colour enters only as <dL/dcolour, colour>: two numbers a vertex are carried. Each
+step drops exactly one vertex, so exactly one record is scattered.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+from difftetvr.render.marching import (
+    Clip,
+    MarchingScene,
+    Rays,
+    Step,
+    corner_of,
+    make_rays,
+    read_vertex,
+    walk,
+)
+from difftetvr.render.walk import Corner, Face
+
+_EXPAND_BUDGET = 1 << 30  # bytes of per-thread gradient copies; beyond it threads share one copy through atomics
+
+
+@dataclass
+class ImageAdjoint:
+    """Flat derivatives of the loss with respect to the kernel's outputs, and those outputs themselves."""
+
+    color: Any
+    transmittance: Any
+    distance: Any
+    out_color: Any
+    out_transmittance: Any
+    out_distance: Any
+
+
+@dataclass
+class Gradients:
+    """Flat gradient buffers.
+
+    Attributes:
+        field: (V, 4) or (T, 4): red, green, blue, density.
+        vertices: (V, 4): x, y, z in camera space and padding; None if positions need no gradient.
+    """
+
+    field: Any
+    vertices: Any | None
+    mode: dr.ReduceMode
+
+
+@dataclass
+class AdjointRay:
+    """State of a ray in the adjoint walk.
+
+    Attributes:
+        transmittance: Transmittance up to the current crossing.
+        rest: Part of <dL/dimage, image> that lies behind it.
+        carry: Derivatives with respect to distance, density and radiance at the crossing, from the cell in front.
+    """
+
+    transmittance: Any
+    rest: Any
+    carry: list[Any]
+
+
+@dataclass
+class PixelAdjoint:
+    """Derivatives of the loss with respect to one pixel."""
+
+    color: list[Any]
+    distance: Any
+
+
+def reduce_mode(scene: MarchingScene, floats: int) -> dr.ReduceMode:
+    """On CPUs one gradient copy a thread beats atomics, as long as the copies fit a budget."""
+    if scene.backend.name != "llvm":
+        return dr.ReduceMode.Auto
+    size = floats * (8 if scene.backend.is_double else 4) * dr.thread_count()
+    return dr.ReduceMode.Expand if size <= _EXPAND_BUDGET else dr.ReduceMode.Local
+
+
+def render_adjoint(scene: MarchingScene, image: ImageAdjoint, vertex_count: int, with_vertices: bool) -> Gradients:
+    """Gradients of a view with respect to the field and, if asked, the vertices in camera space.
+
+    Args:
+        scene: The scene that ``render_forward`` saw.
+        image: Derivatives with respect to the image, and the image.
+        vertex_count: Number of vertices V.
+        with_vertices: Whether positions need gradients; the kernel is cheaper without.
+    """
+    real = scene.backend.Float
+    field_count = vertex_count if scene.cells is None else dr.width(scene.cells) // 4
+    gradients = Gradients(
+        dr.zeros(real, 4 * field_count),
+        dr.zeros(real, 4 * vertex_count) if with_vertices else None,
+        reduce_mode(scene, 4 * field_count + (4 * vertex_count if with_vertices else 0)),
+    )
+    kernel = _AdjointKernel(scene, gradients, make_rays(scene), image)
+    walk(scene, kernel.rays, kernel.read, kernel.visit, kernel.leave, kernel.start())
+    dr.eval(gradients.field, gradients.vertices) if with_vertices else dr.eval(gradients.field)
+    return gradients
+
+
+class _AdjointKernel:
+    """The parts of the adjoint walk: reading vertices, visiting cells, leaving the mesh."""
+
+    def __init__(self, scene: MarchingScene, gradients: Gradients, rays: Rays, image: ImageAdjoint) -> None:
+        self.scene, self.gradients, self.rays = scene, gradients, rays
+        real, pixel, valid = scene.backend.Float, rays.pixel, rays.valid
+        color = [dr.gather(real, image.color, 3 * pixel + k, valid) for k in range(3)]
+        self.pixel = PixelAdjoint(color, dr.gather(real, image.distance, pixel, valid))
+        self.image = image
+        # Accumulators of a vertex: radiance, density, and its position in the ray's frame; cells take the first two.
+        self.field_slots = 0 if scene.cells is not None else 2
+        self.slots = self.field_slots + (3 if gradients.vertices is not None else 0)
+
+    def start(self) -> AdjointRay:
+        real, pixel, valid = self.scene.backend.Float, self.rays.pixel, self.rays.valid
+        rest = self.pixel.distance * dr.gather(real, self.image.out_distance, pixel, valid)
+        for k in range(3):
+            rest = dr.fma(self.pixel.color[k], dr.gather(real, self.image.out_color, 3 * pixel + k, valid), rest)
+        transmittance = dr.gather(real, self.image.out_transmittance, pixel, valid)
+        rest = dr.fma(dr.gather(real, self.image.transmittance, pixel, valid), transmittance, rest)
+        lanes = dr.width(pixel)
+        return AdjointRay(dr.ones(real, lanes), rest, [dr.zeros(real, lanes) for _ in range(3)])
+
+    def read(self, vertex: Any, active: Any) -> Corner:
+        position, attributes = read_vertex(self.scene, vertex, active)
+        values = [attributes[0], self._radiance(attributes[1:])] if attributes else []
+        return corner_of(self.rays.frame, vertex, position, values, self.slots)
+
+    def _radiance(self, color: list[Any]) -> Any:
+        g = self.pixel.color
+        return dr.fma(g[0], color[0], dr.fma(g[1], color[1], g[2] * color[2]))
+
+    def visit(self, step: Step, ray: AdjointRay) -> AdjointRay:
+        entry, leaving = step.entry, step.leaving
+        clip = Clip.at_camera(entry[0], leaving[0]) if self.scene.entries.camera_inside else None
+        start = clip.apply(entry, leaving) if clip else entry
+        if self.scene.cells is not None:
+            record = dr.gather(self.scene.backend.Float4, self.scene.cells, step.cell)
+            constant = [record[3], self._radiance([record[0], record[1], record[2]])]
+            start, leaving = [start[0], *constant], [leaving[0], *constant]
+        ray, at_start, at_end = self._cross(start, leaving, ray)
+        if self.scene.cells is not None:
+            self._scatter_field(step.cell, at_start[2] + at_end[2], at_start[1] + at_end[1], True)
+            at_start, at_end = at_start[:1], at_end[:1]
+        if clip:
+            at_start, at_end = self._unclip(clip, entry, step.leaving, at_start, at_end)
+        self._distribute(step.face, [c + g for c, g in zip(ray.carry, at_start, strict=False)])
+        self._scatter(
+            step.exit.vertex(step.face),
+            [step.exit.pick([corner.adjoints[i] for corner in step.face.corners]) for i in range(self.slots)],
+            True,
+        )
+        step.exit.carry_adjoints(step.face, step.next_face)
+        zero = ray.rest * 0.0
+        return AdjointRay(ray.transmittance, ray.rest, [*at_end, *(zero for _ in range(3 - len(at_end)))])
+
+    def _cross(self, start: list[Any], end: list[Any], ray: AdjointRay) -> tuple[AdjointRay, list[Any], list[Any]]:
+        """Adjoint of one cell: derivatives with respect to (distance, density, radiance) at its start and end."""
+        (t0, s0, q0), (t1, s1, q1) = start, end
+        # Seen by the weights, distance is one more colour.
+        q0, q1 = dr.fma(self.pixel.distance, t0, q0), dr.fma(self.pixel.distance, t1, q1)
+        length = dr.fmax(t1 - t0, 0.0)
+        g0, g1 = q0 * ray.transmittance, q1 * ray.transmittance
+        w0, w1, transmittance, d_length, d_s0, d_s1 = self.scene.optics.adjoint(length, s0, s1, g0, g1, type(length)(0))
+        rest = ray.rest - dr.fma(w0, g0, w1 * g1)
+        # All that is still ahead is seen through this cell: its optical depth L (s0 + s1) / 2 dims the rest.
+        half = 0.5 * rest
+        d_length = dr.select(t1 > t0, dr.fma(-half, s0 + s1, d_length), 0.0)
+        d_s0, d_s1 = dr.fma(-half, length, d_s0), dr.fma(-half, length, d_s1)
+        w0, w1 = w0 * ray.transmittance, w1 * ray.transmittance
+        at_start = [dr.fma(self.pixel.distance, w0, -d_length), d_s0, w0]
+        at_end = [dr.fma(self.pixel.distance, w1, d_length), d_s1, w1]
+        return AdjointRay(ray.transmittance * transmittance, rest, ray.carry), at_start, at_end
+
+    def _unclip(
+        self, clip: Clip, entry: list[Any], leaving: list[Any], at_start: list[Any], at_end: list[Any]
+    ) -> tuple[list[Any], list[Any]]:
+        """Derivatives at a clipped crossing's true entry and exit; the start itself stays at the camera."""
+        t0, t1 = entry[0], leaving[0]
+        inverse = dr.rcp(dr.fmax(t1 - t0, 1e-30))
+        dx = sum((g * (v1 - v0) for g, v0, v1 in zip(at_start[1:], entry[1:], leaving[1:], strict=True)), t0 * 0.0)
+        dx = dr.select(clip.x < 1.0, dx * inverse * inverse, 0.0)
+        entry_gradient = [dr.select(clip.clipped, -t1 * dx, at_start[0])]
+        leaving_gradient = [dr.select(clip.clipped, dr.fma(t0, dx, at_end[0]), at_end[0])]
+        for g0, g1 in zip(at_start[1:], at_end[1:], strict=True):
+            entry_gradient.append((1.0 - clip.x) * g0)
+            leaving_gradient.append(dr.fma(clip.x, g0, g1))
+        return entry_gradient, leaving_gradient
+
+    def leave(self, face: Face, ray: AdjointRay, active: Any) -> AdjointRay:
+        carry = ray.carry[:1] if self.scene.cells is not None else ray.carry
+        self._distribute(face, carry)
+        for corner in face.corners:
+            self._scatter(corner.vertex, corner.adjoints, active)
+        return AdjointRay(ray.transmittance, ray.rest, [c * 0.0 for c in ray.carry])
+
+    def _distribute(self, face: Face, crossing: list[Any]) -> None:
+        """Add a crossing's derivatives to the accumulators of its face's corners."""
+        weights = face.weights()
+        if self.field_slots:
+            for corner, weight in zip(face.corners, weights, strict=True):
+                corner.adjoints[0] = dr.fma(weight, crossing[2], corner.adjoints[0])
+                corner.adjoints[1] = dr.fma(weight, crossing[1], corner.adjoints[1])
+        if self.gradients.vertices is None:
+            return
+        slope_a, slope_b = _slope(face, crossing)
+        for corner, weight in zip(face.corners, weights, strict=True):
+            first = self.field_slots
+            corner.adjoints[first] = dr.fma(-weight, slope_a, corner.adjoints[first])
+            corner.adjoints[first + 1] = dr.fma(-weight, slope_b, corner.adjoints[first + 1])
+            corner.adjoints[first + 2] = dr.fma(weight, crossing[0], corner.adjoints[first + 2])
+
+    def _scatter(self, vertex: Any, adjoints: list[Any], active: Any) -> None:
+        if self.field_slots:
+            self._scatter_field(vertex, adjoints[0], adjoints[1], active)
+        if self.gradients.vertices is not None:
+            position = self.rays.frame.to_camera_space(*adjoints[self.field_slots :])
+            self._scatter_record(self.gradients.vertices, vertex, [*position, position[0] * 0.0], active)
+
+    def _scatter_field(self, index: Any, radiance: Any, density: Any, active: Any) -> None:
+        record = [radiance * g for g in self.pixel.color] + [density]
+        self._scatter_record(self.gradients.field, index, record, active)
+
+    def _scatter_record(self, buffer: Any, index: Any, record: list[Any], active: Any) -> None:
+        dr.scatter_add(buffer, self.scene.backend.Float4(*record), index, active, mode=self.gradients.mode)
+
+
+def _slope(face: Face, crossing: list[Any]) -> tuple[Any, Any]:
+    """Slope over the ray's plane of the face's linear interpolant of <crossing, values>.
+
+    Moving the face by (da, db) against the ray changes the crossing's value by minus this slope times the move, which
+    is where the hit point's own motion enters (DESIGN section 5: w_k (-H_a, -H_b, g_t)).
+    """
+    a, b, c = face.corners
+    total = face.edges[0] + face.edges[1] + face.edges[2]
+    inverse = dr.select(total > 0, 1.0 / total, 0.0)
+    # Differences of values, since the distances of a far mesh would cancel.
+    change = []
+    for corner in (b, c):
+        pairs = zip(crossing, corner.values, a.values, strict=True)
+        change.append(sum((g * (v1 - v0) for g, v1, v0 in pairs), inverse * 0.0))
+    slope_a = (change[0] * (c.b - a.b) + change[1] * (a.b - b.b)) * inverse
+    slope_b = (change[0] * (a.a - c.a) + change[1] * (b.a - a.a)) * inverse
+    return slope_a, slope_b

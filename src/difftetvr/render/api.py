@@ -1,0 +1,96 @@
+"""``render``: from a mesh, its field and a camera to an image, differentiable in all of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from difftetvr.backend import backend_for
+from difftetvr.errors import DiffTetError, MeshError
+from difftetvr.mesh import Field, TetMesh
+from difftetvr.optics import ConstantPerCell, ExactLinear, OpticalModel
+from difftetvr.render.autograd import MarchingFunction, MarchingTask
+from difftetvr.render.camera import Camera
+
+RENDERERS = ("marching",)
+
+
+@dataclass(frozen=True)
+class RenderedImage:
+    """An image of a tetrahedral volume.
+
+    Attributes:
+        color: (H, W, 3) premultiplied radiance, linear RGB, composited over the background.
+        alpha: (H, W) opacity in [0, 1]: one minus the transmittance of the whole ray.
+        depth: (H, W) expected distance from the camera at which light is absorbed, in world units; 0 where alpha is 0.
+    """
+
+    color: torch.Tensor
+    alpha: torch.Tensor
+    depth: torch.Tensor
+
+
+def render(
+    mesh: TetMesh,
+    field: Field,
+    camera: Camera,
+    background: torch.Tensor | tuple[float, float, float] | None = None,
+    renderer: str = "marching",
+    optics: OpticalModel | None = None,
+    transmittance_threshold: float = 0.0,
+) -> RenderedImage:
+    """Render a tetrahedral mesh by emission and absorption (article section 3, solved exactly).
+
+    Differentiable once in ``mesh.vertices``, ``field.color``, ``field.density``, ``camera.world_to_camera`` and
+    ``background``, as far as these require gradients. Runs on the device and at the precision of ``mesh.vertices``.
+
+    Args:
+        mesh: Tetrahedral mesh; its vertices' device and dtype (float32 or float64) decide where and how to render.
+        field: Colour and density per vertex (linear inside each cell) or per cell (constant).
+        camera: Pinhole camera, inside or outside of the mesh.
+        background: (3,) linear RGB behind the volume; black if None.
+        renderer: How crossings are found and ordered; ``"marching"``.
+        optics: Optical model of one cell; exact integration of the linear field if None.
+        transmittance_threshold: Rays stop once their transmittance is at or below this value, in [0, 1); 0 stops none early.
+
+    Returns:
+        The image, on the device of ``mesh.vertices``.
+
+    Raises:
+        MeshError: The field does not fit the mesh, or holds a negative density or a value that is not finite.
+        DiffTetError: An argument is out of range.
+        BackendError: No back end runs on the device of the vertices.
+    """
+    if renderer not in RENDERERS:
+        raise DiffTetError(f"There is no renderer '{renderer}'; choose one of {', '.join(RENDERERS)}.")
+    if not 0.0 <= transmittance_threshold < 1.0:
+        raise DiffTetError(f"transmittance_threshold is {transmittance_threshold}; it must lie in [0, 1).")
+    per_cell = field.location_on(mesh) == "cell"
+    field.validate(mesh)
+    for name, tensor in (("color", field.color), ("density", field.density)):
+        if tensor.device != mesh.vertices.device:
+            raise MeshError(
+                f"The field's {name} is on '{tensor.device}' but the mesh on '{mesh.vertices.device}'; move one of them."
+            )
+    backend = backend_for(mesh.vertices)
+    if optics is None:
+        optics = ConstantPerCell() if per_cell else ExactLinear()
+    task = MarchingTask(backend, mesh, camera, optics, per_cell, transmittance_threshold)
+    vertices = camera.to_camera_space(mesh.vertices)
+    color, density = field.color.to(backend.dtype), field.density.to(backend.dtype)
+    color, transmittance, distance = MarchingFunction.apply(task, vertices, color, density)
+    return _compose(color, transmittance, distance, background)
+
+
+def _compose(color: Any, transmittance: Any, distance: Any, background: Any) -> RenderedImage:
+    if background is not None:
+        behind = torch.as_tensor(background, dtype=color.dtype, device=color.device)
+        if behind.shape != (3,):
+            raise DiffTetError(f"background has shape {tuple(behind.shape)}; give three linear RGB components.")
+        color = color + transmittance[..., None] * behind
+    alpha = 1.0 - transmittance
+    visible = alpha > 0
+    depth = torch.where(visible, distance / torch.where(visible, alpha, 1.0), 0.0)
+    return RenderedImage(color, alpha, depth)

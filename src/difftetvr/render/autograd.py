@@ -1,0 +1,79 @@
+"""The marching renderer as a PyTorch operation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch.autograd.function import once_differentiable
+
+from difftetvr.backend import Backend
+from difftetvr.mesh import TetMesh
+from difftetvr.optics import OpticalModel
+from difftetvr.render.adjoint import ImageAdjoint, render_adjoint
+from difftetvr.render.camera import Camera
+from difftetvr.render.entry import find_entries
+from difftetvr.render.marching import MarchingScene, render_forward
+from difftetvr.render.walk import walk_table
+
+
+@dataclass(frozen=True)
+class MarchingTask:
+    """What a view needs besides tensors that may require gradients."""
+
+    backend: Backend
+    mesh: TetMesh
+    camera: Camera
+    optics: OpticalModel
+    per_cell: bool
+    threshold: float
+
+    def scene(self, vertices: torch.Tensor, color: torch.Tensor, density: torch.Tensor) -> MarchingScene:
+        """Upload a view: (V, 3) vertices in camera space, (N, 3) colours and (N,) densities of vertices or cells."""
+        backend = self.backend
+        padding = vertices.new_zeros(vertices.shape[0], 1)
+        if self.per_cell:
+            records = torch.cat([vertices, padding], dim=1)
+            cells = backend.floats(torch.cat([color, density[:, None]], dim=1))
+        else:
+            records = torch.cat([vertices, density[:, None], color, padding], dim=1)
+            cells = None
+        return MarchingScene(
+            backend,
+            self.camera,
+            self.optics,
+            backend.floats(records),
+            cells,
+            backend.uints(walk_table(self.mesh)),
+            find_entries(backend, self.mesh, vertices, self.camera),
+            backend.opaque(self.threshold),
+        )
+
+
+class MarchingFunction(torch.autograd.Function):
+    """(V, 3) camera-space vertices, colours and densities to (H, W, 3) radiance, (H, W) transmittance and distance."""
+
+    @staticmethod
+    def forward(ctx: Any, task: MarchingTask, vertices: Any, color: Any, density: Any) -> Any:
+        """Render; keeps only the image and, while gradients are wanted, the uploaded scene."""
+        scene = task.scene(vertices, color, density)
+        width, height = task.camera.width, task.camera.height
+        outputs = render_forward(scene)
+        shapes = ((height, width, 3), (height, width), (height, width))
+        image = tuple(task.backend.tensor(out, *shape) for out, shape in zip(outputs, shapes, strict=True))
+        ctx.task, ctx.scene, ctx.vertex_count = task, scene, vertices.shape[0]
+        ctx.save_for_backward(*image)
+        return image
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, g_color: Any, g_transmittance: Any, g_distance: Any) -> Any:
+        """Walk again with the image's derivatives."""
+        backend = ctx.task.backend
+        parts = [backend.floats(t) for t in (g_color, g_transmittance, g_distance, *ctx.saved_tensors)]
+        needs_vertices, needs_color, needs_density = ctx.needs_input_grad[1:]
+        gradients = render_adjoint(ctx.scene, ImageAdjoint(*parts), ctx.vertex_count, needs_vertices)
+        field = backend.tensor(gradients.field).reshape(-1, 4)
+        vertices = backend.tensor(gradients.vertices).reshape(-1, 4)[:, :3] if needs_vertices else None
+        return None, vertices, field[:, :3] if needs_color else None, field[:, 3] if needs_density else None
