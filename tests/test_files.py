@@ -1,0 +1,176 @@
+"""Files appear whole or not at all."""
+
+import os
+import resource
+import shutil
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from difftetvr.errors import CaptureError, DiffTetError, MeshError
+from difftetvr.files import atomic_write
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(entry.name for entry in folder.iterdir())
+
+
+def test_the_file_appears_only_when_the_body_ends(tmp_path):
+    target = tmp_path / "model.vtu"
+    with atomic_write(target) as temporary:
+        assert temporary.parent == tmp_path and temporary.suffix == ".vtu" and temporary != target
+        temporary.write_text("whole")
+        assert not target.exists()
+    assert target.read_text() == "whole"
+    assert names(tmp_path) == ["model.vtu"]
+
+
+@pytest.mark.parametrize("interruption", [KeyboardInterrupt, SystemExit, ValueError, MeshError("bad")])
+def test_a_failing_body_leaves_the_old_file_and_nothing_else(tmp_path, interruption):
+    target = tmp_path / "model.vtu"
+    target.write_text("old")
+    with pytest.raises(interruption if isinstance(interruption, type) else type(interruption)):
+        with atomic_write(target) as temporary:
+            temporary.write_text("half")
+            raise interruption
+    assert target.read_text() == "old"
+    assert names(tmp_path) == ["model.vtu"]
+
+
+def test_a_body_may_replace_the_temporary_file_itself(tmp_path):
+    target = tmp_path / "picture.png"
+    with atomic_write(target, fsync=True) as temporary:
+        temporary.unlink()
+        temporary.write_bytes(b"new")
+    assert target.read_bytes() == b"new"
+
+
+def test_a_body_that_removes_its_file_is_an_error_and_keeps_the_old_one(tmp_path):
+    target = tmp_path / "a.json"
+    target.write_text("old")
+    with pytest.raises(DiffTetError), atomic_write(target) as temporary:
+        temporary.unlink()
+    assert target.read_text() == "old"
+
+
+def test_permissions_are_those_of_the_replaced_file_or_of_a_new_one(tmp_path):
+    previous = os.umask(0o027)
+    try:
+        target = tmp_path / "metrics.json"
+        with atomic_write(target) as temporary:
+            temporary.write_text("1")
+        assert stat.S_IMODE(target.stat().st_mode) == 0o640
+        target.chmod(0o604)
+        with atomic_write(target) as temporary:
+            temporary.write_text("2")
+        assert stat.S_IMODE(target.stat().st_mode) == 0o604
+    finally:
+        os.umask(previous)
+
+
+def test_a_symbolic_link_stays_one(tmp_path):
+    real, link = tmp_path / "real.json", tmp_path / "link.json"
+    real.write_text("old")
+    link.symlink_to(real)
+    with atomic_write(link) as temporary:
+        temporary.write_text("new")
+    assert link.is_symlink() and real.read_text() == "new"
+
+
+def fail_in_missing_folder(folder: Path) -> Path:
+    return folder / "none" / "a.png"
+
+
+def fail_on_folder(folder: Path) -> Path:
+    return folder
+
+
+def fail_below_file(folder: Path) -> Path:
+    (folder / "file").write_text("")
+    return folder / "file" / "a.png"
+
+
+def fail_on_device(folder: Path) -> Path:
+    return Path(os.devnull)
+
+
+def fail_on_long_name(folder: Path) -> Path:
+    return folder / ("x" * 300 + ".png")
+
+
+@pytest.mark.parametrize(
+    ("bad_target", "reason", "advice"),
+    [
+        (fail_in_missing_folder, "no such file or directory", "create the folder first"),
+        (fail_on_folder, "is a directory", "choose the name of a file"),
+        (fail_below_file, "not a directory", "does not run through a file"),
+        (fail_on_device, "not a regular file", "choose the name of an ordinary file"),
+        (fail_on_long_name, "file name too long", "choose a shorter name"),
+    ],
+)
+def test_impossible_targets_give_one_sentence_of_the_given_kind(tmp_path, bad_target, reason, advice):
+    target = bad_target(tmp_path)
+    with pytest.raises(CaptureError) as raised, atomic_write(target, CaptureError):
+        pytest.fail("the body must not run")
+    sentence = str(raised.value)
+    assert sentence.startswith(f"Cannot write {target}: {reason}; ")
+    assert advice in sentence and sentence.endswith(".") and "\n" not in sentence
+    assert os.path.exists(os.devnull) and not os.path.isfile(os.devnull)
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write everywhere")
+def test_no_permission(tmp_path):
+    tmp_path.chmod(0o500)
+    with pytest.raises(DiffTetError, match="choose a folder you may write to"), atomic_write(tmp_path / "a.png"):
+        pytest.fail("the body must not run")
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full here")
+def test_a_full_disk_met_in_the_body(tmp_path):
+    with pytest.raises(DiffTetError, match=r": no space left on device; free some space or choose another disk\.$"):
+        with atomic_write(tmp_path / "a.vtu"), open("/dev/full", "w") as file:
+            file.write("x" * 100_000)
+    assert names(tmp_path) == []
+
+
+def test_a_limit_on_file_sizes_met_in_the_body(tmp_path):
+    target = tmp_path / "a.vtu"
+    target.write_text("old")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
+    try:
+        with pytest.raises(MeshError, match="file too large"), atomic_write(target, MeshError) as temporary:
+            temporary.write_bytes(bytes(5000))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert target.read_text() == "old"
+    assert names(tmp_path) == ["a.vtu"]
+
+
+SAVE_ON_FULL_DISK = """
+import sys
+from difftetvr.errors import MeshError
+from difftetvr.files import atomic_write
+try:
+    with atomic_write(sys.argv[1] + "/a.vtu", MeshError) as temporary:
+        temporary.write_bytes(bytes(1_000_000))
+except MeshError as error:
+    print(error)
+"""
+
+
+def test_a_disk_that_is_really_full(tmp_path):
+    script = 'mount -t tmpfs -o size=64k none "$1" && "$2" -c "$3" "$1" && ls -A "$1"'
+    if not shutil.which("unshare") or subprocess.run(["unshare", "-m", "true"], capture_output=True).returncode:
+        pytest.skip("no mount namespaces here")
+    command = ["unshare", "-m", "sh", "-c", script, "sh", str(tmp_path), sys.executable, SAVE_ON_FULL_DISK]
+    source = str(Path(__file__).parents[1] / "src")
+    environment = {**os.environ, "PYTHONPATH": source}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment)
+    if "mount" in done.stderr:
+        pytest.skip("mounting is not allowed here")
+    sentence = f"Cannot write {tmp_path}/a.vtu: no space left on device; free some space or choose another disk.\n"
+    assert (done.stdout, done.stderr) == (sentence, "")
