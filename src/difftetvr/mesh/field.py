@@ -1,0 +1,118 @@
+"""Colour and density on a tetrahedral mesh."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import torch
+
+from difftetvr.errors import MeshError
+
+if TYPE_CHECKING:
+    from difftetvr.mesh.tetmesh import TetMesh
+
+Location = Literal["vertex", "cell"]
+
+
+@dataclass(frozen=True, eq=False)
+class Field:
+    """What a mesh emits and absorbs: linear between its vertices, or constant in each cell.
+
+    Attributes:
+        color: (V, 3) per vertex or (T, 3) per cell; emitted linear RGB, float32 or float64, may require grad.
+        density: (V,) or (T,) extinction per unit length, >= 0, of the same length; may require grad.
+        location: "vertex" or "cell"; None lets the lengths decide, vertices first where both fit.
+
+    Raises:
+        MeshError: The shapes do not belong together, the values are no real numbers, or the location is unknown.
+    """
+
+    color: torch.Tensor
+    density: torch.Tensor
+    location: Location | None = None
+
+    def __post_init__(self) -> None:
+        color = _as_floats(self.color, "color")
+        density = _as_floats(self.density, "density")
+        if color.ndim != 2 or color.shape[1] != 3:
+            raise MeshError(f"The field's color has shape {tuple(color.shape)}; pass linear RGB of shape (N, 3).")
+        if density.shape != color.shape[:1]:
+            raise MeshError(
+                f"The field's density has shape {tuple(density.shape)} and its color {tuple(color.shape)}; "
+                f"pass one density for each color, shape ({color.shape[0]},)."
+            )
+        if self.location not in (None, "vertex", "cell"):
+            raise MeshError(f'The field\'s location is {self.location!r}; pass "vertex", "cell" or None.')
+        object.__setattr__(self, "color", color)
+        object.__setattr__(self, "density", density)
+
+    def __len__(self) -> int:
+        """Number of vertices or cells the field has values for."""
+        return self.color.shape[0]
+
+    def location_on(self, mesh: TetMesh) -> Location:
+        """Where on `mesh` the values live.
+
+        Args:
+            mesh: The mesh the field belongs to.
+
+        Returns:
+            "vertex" or "cell".
+
+        Raises:
+            MeshError: The field's length is not that of the location.
+        """
+        counts: dict[Location, int] = {"vertex": mesh.num_vertices, "cell": mesh.num_cells}
+        candidates: tuple[Location, ...] = ("vertex", "cell") if self.location is None else (self.location,)
+        for location in candidates:
+            if len(self) == counts[location]:
+                return location
+        wanted = " or ".join(f"{counts[location]} for one per {location}" for location in candidates)
+        raise MeshError(f"The field has {len(self)} values, but this mesh needs {wanted}.")
+
+    def validate(self, mesh: TetMesh) -> None:
+        """Check that the field belongs to the mesh and holds values that can be rendered.
+
+        Args:
+            mesh: The mesh the field belongs to.
+
+        Raises:
+            MeshError: The length fits neither vertices nor cells, or a color or density is not finite, or a density is
+                negative; names the first such vertex or cell.
+        """
+        location = self.location_on(mesh)
+        color, density = self.color.detach(), self.density.detach()
+        _refuse_first(~torch.isfinite(color).all(1), color, f"color of {location}", "make every color finite")
+        _refuse_first(~torch.isfinite(density), density, f"density of {location}", "make every density finite")
+        _refuse_first(density < 0, density, f"density of {location}", "densities must not be negative")
+
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Field:
+        """The same field on another device or in another precision.
+
+        Args:
+            device: Target device, or None to stay.
+            dtype: torch.float32 or torch.float64, or None to stay.
+
+        Returns:
+            A field that autograd sees as a function of this one.
+        """
+        return Field(
+            self.color.to(device=device, dtype=dtype), self.density.to(device=device, dtype=dtype), self.location
+        )
+
+
+def _as_floats(values: Any, what: str) -> torch.Tensor:
+    try:
+        tensor = torch.as_tensor(values)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise MeshError(f"The field's {what} cannot be read as an array of numbers; pass a tensor.") from error
+    if tensor.is_complex() or tensor.dtype == torch.bool:
+        raise MeshError(f"The field's {what} is {tensor.dtype}; pass float32 or float64.")
+    return tensor if tensor.dtype in (torch.float32, torch.float64) else tensor.to(torch.float32)
+
+
+def _refuse_first(bad: torch.Tensor, values: torch.Tensor, what: str, advice: str) -> None:
+    if bad.any():
+        index = int(torch.nonzero(bad)[0, 0])
+        raise MeshError(f"The {what} {index} is {values[index].tolist()}; {advice}.")
