@@ -1,0 +1,42 @@
+# `make demo` and `make test` need Python >= 3.10 and nothing else: each sets up all it uses (see scripts/setup.sh).
+# Paths are relative throughout, so the folder's own path may hold spaces.
+
+BIN := .venv/bin
+# Which scripts `make bench` runs.
+BENCHMARKS ?= $(wildcard benchmarks/*.py)
+
+.PHONY: help setup demo test lint bench clean distclean
+
+help:
+	@echo 'make demo       reconstruct the Tooth CT scan from rendered views; pictures in out/demo'
+	@echo 'make test       lint, types and all tests'
+	@echo 'make lint       lint and types only'
+	@echo 'make bench      print the tables of docs/results.md'
+	@echo 'make setup      only set up .venv and libLLVM (the others do it too)'
+	@echo 'make clean      remove caches, builds and out/;  make distclean  .venv too'
+
+setup:
+	@sh scripts/setup.sh
+
+demo: setup
+	$(BIN)/difftetvr fit tooth -o out/demo
+	@echo
+	@echo 'Pictures (truth | reconstruction | difference) and plots lie in out/demo; out/demo/model.vtu opens in ParaView.'
+
+test: lint
+	$(BIN)/python -m pytest -q --durations=10
+
+lint: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+bench: setup
+	@for script in $(BENCHMARKS); do echo "== $$script"; $(BIN)/python "$$script" || exit 1; done
+
+clean:
+	rm -rf out build dist .pytest_cache .hypothesis .mypy_cache .ruff_cache
+	find src tests examples benchmarks scripts -name __pycache__ -type d -prune -exec rm -rf {} +
+
+distclean: clean
+	rm -rf .venv
