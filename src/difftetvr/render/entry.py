@@ -128,7 +128,8 @@ def find_entries(backend: Backend, mesh: TetMesh, camera_vertices: torch.Tensor,
     if lists.is_simple:
         lists.offset = dr.arange(backend.UInt, camera.width * camera.height)
         return lists
-    lists.offset = dr.prefix_sum(count) - count
+    counts = backend.tensor(backend.Int(count))
+    lists.offset = backend.uints((counts.cumsum(0) - counts).to(torch.int32))
     lists.rows = _fill_lists(scene, items, lists, start)
     return lists
 
@@ -242,15 +243,15 @@ def _work_items(scene: _Scene, rows: int) -> _WorkItems | None:
         box.append((scene.backend.Int(dr.floor(begin)), scene.backend.Int(dr.floor(end))))
     (column0, column1), (row0, row1) = box
     visible = (farthest > 0) & (column1 >= column0) & (row1 >= row0)
-    heights = dr.select(visible, uint(row1 - row0 + 1), uint(0))
-    ends = dr.prefix_sum(heights)
-    dr.eval(ends, heights, column0, column1, row0)
-    total = int(ends[rows - 1])
+    heights = backend.tensor(dr.select(visible, row1 - row0 + 1, 0))
+    faces = torch.arange(rows, dtype=torch.int32, device=backend.device)
+    owners = torch.repeat_interleave(faces, heights)
+    total = owners.shape[0]
     if total == 0:
         return None
-    item = dr.arange(uint, total)
-    owner = uint(dr.binary_search(0, rows, lambda index: dr.gather(uint, ends, uint(index)) <= item))
-    offset = item - (dr.gather(uint, ends, owner) - dr.gather(uint, heights, owner))
+    begins = (heights.cumsum(0) - heights).to(torch.int32)
+    owner = backend.uints(owners)
+    offset = dr.arange(uint, total) - dr.gather(uint, backend.uints(begins), owner)
     row = uint(dr.gather(backend.Int, row0, owner)) + offset
     first_column, last_column = (uint(dr.gather(backend.Int, c, owner)) for c in (column0, column1))
     dr.eval(owner, row, first_column, last_column)
