@@ -32,10 +32,10 @@ def test_the_file_appears_only_when_the_body_ends(tmp_path):
 def test_a_failing_body_leaves_the_old_file_and_nothing_else(tmp_path, interruption):
     target = tmp_path / "model.vtu"
     target.write_text("old")
-    with pytest.raises(interruption if isinstance(interruption, type) else type(interruption)):
-        with atomic_write(target) as temporary:
-            temporary.write_text("half")
-            raise interruption
+    kind = interruption if isinstance(interruption, type) else type(interruption)
+    with pytest.raises(kind), atomic_write(target) as temporary:
+        temporary.write_text("half")
+        raise interruption
     assert target.read_text() == "old"
     assert names(tmp_path) == ["model.vtu"]
 
@@ -130,9 +130,9 @@ def test_no_permission(tmp_path):
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full here")
 def test_a_full_disk_met_in_the_body(tmp_path):
-    with pytest.raises(DiffTetError, match=r": no space left on device; free some space or choose another disk\.$"):
-        with atomic_write(tmp_path / "a.vtu"), open("/dev/full", "w") as file:
-            file.write("x" * 100_000)
+    sentence = r": no space left on device; free some space or choose another disk\.$"
+    with pytest.raises(DiffTetError, match=sentence), atomic_write(tmp_path / "a.vtu"), open("/dev/full", "w") as file:
+        file.write("x" * 100_000)
     assert names(tmp_path) == []
 
 

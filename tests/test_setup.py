@@ -8,7 +8,25 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-TOOLS = "awk cat chmod cksum cp dirname env grep mkdir mv rm sed sh sort tail touch true".split()
+TOOLS = [
+    "awk",
+    "cat",
+    "chmod",
+    "cksum",
+    "cp",
+    "dirname",
+    "env",
+    "grep",
+    "mkdir",
+    "mv",
+    "rm",
+    "sed",
+    "sh",
+    "sort",
+    "tail",
+    "touch",
+    "true",
+]
 
 # Stands for a Python: its version and modules come from the environment, and a venv is a copy of itself.
 PYTHON = r"""#!/bin/sh

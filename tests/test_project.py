@@ -1,0 +1,146 @@
+"""The house's rules: which part may import which, how long a file may be, what the package says of itself."""
+
+import ast
+import os
+import re
+import subprocess
+import sys
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "src" / "difftetvr"
+SOURCES = sorted(PACKAGE.rglob("*.py"))
+
+GROUND = {"errors", "files", "libllvm"}
+"""Modules that import nothing of this package but each other."""
+
+ALLOWED = {
+    "backend": GROUND,
+    "mesh": GROUND,
+    "optics": GROUND | {"backend"},
+    "render": GROUND | {"backend", "mesh", "optics"},
+    "capture": GROUND | {"backend", "mesh", "optics", "render"},
+    "fit": GROUND | {"backend", "mesh", "optics", "render", "capture"},
+    "view": GROUND | {"backend", "mesh", "optics", "render", "capture", "fit"},
+}
+"""Parts, each with the parts it may import besides itself. `cli` and the package's surface may import all.
+
+`view` and `fit` are one storey; of the two, the one that shows results may know what a result is, never the reverse.
+"""
+
+MAY_TOUCH_DRJIT = {"backend", "optics", "render", "capture"}
+"""Parts that hold kernels, or torch functions around them."""
+
+
+def part_of(file: Path) -> str:
+    return file.relative_to(PACKAGE).parts[0].removesuffix(".py")
+
+
+def module_of(file: Path) -> list[str]:
+    parts = ["difftetvr", *file.relative_to(PACKAGE).with_suffix("").parts]
+    return parts[:-1] if parts[-1] == "__init__" else parts
+
+
+def imported_modules(file: Path, module: list[str]) -> set[str]:
+    """Full names of everything a file imports, anywhere in it, lazy imports and relative ones included."""
+    package = module if file.name == "__init__.py" else module[:-1]
+    names = set()
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            start = package[: len(package) - node.level + 1] if node.level else []
+            base = ".".join([*start, *([node.module] if node.module else [])])
+            names |= {f"{base}.{alias.name}" for alias in node.names}
+    return names
+
+
+def imported_parts(file: Path) -> set[str]:
+    own = [name.split(".") for name in imported_modules(file, module_of(file)) if name.split(".")[0] == "difftetvr"]
+    return {name[1] if len(name) > 1 else "__init__" for name in own}
+
+
+def test_imports_run_downwards_only():
+    wrong = []
+    for file in SOURCES:
+        part = part_of(file)
+        if part in ("__init__", "__main__", "cli"):
+            continue
+        allowed = GROUND if part in GROUND else ALLOWED.get(part)
+        assert allowed is not None, f"{file}: say in this test what the new part '{part}' may import"
+        wrong += [f"{file.relative_to(ROOT)} imports {name}" for name in imported_parts(file) - allowed - {part}]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_the_layering_test_sees_every_kind_of_import(tmp_path):
+    file = tmp_path / "module.py"
+    file.write_text(
+        "import difftetvr.fit.losses as x\nfrom difftetvr import render\nfrom ..mesh import TetMesh\n"
+        "def f():\n    from difftetvr.capture.orbit import g\n    from . import kernels\n"
+    )
+    assert imported_modules(file, ["difftetvr", "optics", "module"]) == {
+        "difftetvr.fit.losses",
+        "difftetvr.render",
+        "difftetvr.mesh.TetMesh",
+        "difftetvr.capture.orbit.g",
+        "difftetvr.optics.kernels",
+    }
+
+
+def test_only_kernels_and_their_wrappers_touch_drjit():
+    users = {
+        part_of(file)
+        for file in SOURCES
+        if any(name.split(".")[0] == "drjit" for name in imported_modules(file, module_of(file)))
+    }
+    assert users <= MAY_TOUCH_DRJIT
+
+
+def test_files_stay_short():
+    scripts = [*(ROOT / "scripts").iterdir(), *(ROOT / "examples").glob("*.py"), *(ROOT / "benchmarks").glob("*.py")]
+    files = [*SOURCES, *(ROOT / "tests").rglob("*.py"), *(file for file in scripts if file.is_file())]
+    lengths = {file.relative_to(ROOT): len(file.read_text(encoding="utf-8").splitlines()) for file in files}
+    assert not {file: length for file, length in lengths.items() if length >= 400}
+
+
+def written_version() -> str:
+    project = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    return re.search(r'^version = "(.+)"$', project, re.MULTILINE)[1]
+
+
+def test_versions_agree():
+    import difftetvr
+
+    version = written_version()
+    assert getattr(difftetvr, "__version__", version) == version
+    try:
+        assert metadata.version("difftetvr") == version
+    except metadata.PackageNotFoundError:
+        pytest.skip("difftetvr is not installed")
+
+
+def test_every_dependency_is_pinned():
+    project = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    lists = re.findall(r"^(?:dependencies|dev|requires) = \[(.*?)\]$", project, re.MULTILINE | re.DOTALL)
+    asked = {name.lower() for entries in lists for name in re.findall(r'"([A-Za-z0-9_-]+)[<>=]', entries)}
+    pins = (ROOT / "requirements" / "lock.txt").read_text(encoding="utf-8").splitlines()
+    lines = [line for line in pins if line and not line.startswith("#")]
+    assert all(re.fullmatch(r'[a-z0-9-]+==[\w.]+(; python_version (>=|<) "3\.11")?', line) for line in lines)
+    assert len(asked) > 10 and asked <= {line.split("==")[0] for line in lines}
+    assert "torch==2.13.0" in lines
+
+
+def test_the_package_says_that_it_is_typed_and_carries_its_data():
+    assert (PACKAGE / "py.typed").is_file()
+    assert {file.name for file in (PACKAGE / "data").iterdir()} >= {"CREDITS.md", "tooth3gauss.json"}
+
+
+def test_importing_the_package_asks_for_no_optional_package():
+    optional = ("viser", "pytetwild", "tetgen", "vtk", "matplotlib", "pytest")
+    code = f"import sys, difftetvr; print([name for name in {optional} if name in sys.modules])"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
