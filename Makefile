@@ -19,9 +19,8 @@ setup:
 	@sh scripts/setup.sh
 
 demo: setup
-	$(BIN)/difftetvr fit tooth -o out/demo
-	@echo
-	@echo 'Pictures (truth | reconstruction | difference) and plots lie in out/demo; out/demo/model.vtu opens in ParaView.'
+	$(BIN)/difftetvr fit tooth -o out/demo --overwrite
+	@echo 'Pictures (truth | reconstruction | difference) and curves lie in out/demo; model.vtu there opens in ParaView.'
 
 test: lint
 	$(BIN)/python -m pytest -q --durations=10
