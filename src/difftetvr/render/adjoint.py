@@ -30,13 +30,18 @@ _EXPAND_BUDGET = 1 << 30  # bytes of per-thread gradient copies; beyond it threa
 
 @dataclass
 class ImageAdjoint:
-    """Flat derivatives of the loss with respect to the kernel's outputs, and those outputs themselves."""
+    """Flat derivatives of the loss with respect to the kernel's outputs, and those outputs.
 
-    color: Any
-    transmittance: Any
-    distance: Any
-    out_color: Any
-    out_transmittance: Any
+    Attributes:
+        light: (H, W, 4) derivatives with respect to radiance and transmittance.
+        distance: (H, W) derivatives with respect to the integral of distance; None if they are all zero.
+        out_light: (H, W, 4) radiance and transmittance.
+        out_distance: (H, W) integral of distance.
+    """
+
+    light: Any
+    distance: Any | None
+    out_light: Any
     out_distance: Any
 
 
@@ -71,10 +76,10 @@ class AdjointRay:
 
 @dataclass
 class PixelAdjoint:
-    """Derivatives of the loss with respect to one pixel."""
+    """Derivatives of the loss with respect to one pixel; distance is None where the loss does not depend on it."""
 
     color: list[Any]
-    distance: Any
+    distance: Any | None
 
 
 def reduce_mode(scene: MarchingScene, floats: int) -> dr.ReduceMode:
@@ -112,23 +117,22 @@ class _AdjointKernel:
 
     def __init__(self, scene: MarchingScene, gradients: Gradients, rays: Rays, image: ImageAdjoint) -> None:
         self.scene, self.gradients, self.rays = scene, gradients, rays
-        real, pixel, valid = scene.backend.Float, rays.pixel, rays.valid
-        color = [dr.gather(real, image.color, 3 * pixel + k, valid) for k in range(3)]
-        self.pixel = PixelAdjoint(color, dr.gather(real, image.distance, pixel, valid))
-        self.image = image
+        backend, pixel, valid = scene.backend, rays.pixel, rays.valid
+        light = dr.gather(backend.Float4, image.light, pixel, valid)
+        seen = dr.gather(backend.Float4, image.out_light, pixel, valid)
+        self.rest = sum((light[k] * seen[k] for k in range(1, 4)), light[0] * seen[0])
+        self.pixel = PixelAdjoint([light[0], light[1], light[2]], None)
+        if image.distance is not None:
+            self.pixel.distance = dr.gather(backend.Float, image.distance, pixel, valid)
+            far = dr.gather(backend.Float, image.out_distance, pixel, valid)
+            self.rest = dr.fma(self.pixel.distance, far, self.rest)
         # Accumulators of a vertex: radiance, density, and its position in the ray's frame; cells take the first two.
         self.field_slots = 0 if scene.cells is not None else 2
         self.slots = self.field_slots + (3 if gradients.vertices is not None else 0)
 
     def start(self) -> AdjointRay:
-        real, pixel, valid = self.scene.backend.Float, self.rays.pixel, self.rays.valid
-        rest = self.pixel.distance * dr.gather(real, self.image.out_distance, pixel, valid)
-        for k in range(3):
-            rest = dr.fma(self.pixel.color[k], dr.gather(real, self.image.out_color, 3 * pixel + k, valid), rest)
-        transmittance = dr.gather(real, self.image.out_transmittance, pixel, valid)
-        rest = dr.fma(dr.gather(real, self.image.transmittance, pixel, valid), transmittance, rest)
-        lanes = dr.width(pixel)
-        return AdjointRay(dr.ones(real, lanes), rest, [dr.zeros(real, lanes) for _ in range(3)])
+        real, lanes = self.scene.backend.Float, dr.width(self.rays.pixel)
+        return AdjointRay(dr.ones(real, lanes), self.rest, [dr.zeros(real, lanes) for _ in range(3)])
 
     def read(self, vertex: Any, active: Any) -> Corner:
         position, attributes = read_vertex(self.scene, vertex, active)
@@ -166,8 +170,9 @@ class _AdjointKernel:
     def _cross(self, start: list[Any], end: list[Any], ray: AdjointRay) -> tuple[AdjointRay, list[Any], list[Any]]:
         """Adjoint of one cell: derivatives with respect to (distance, density, radiance) at its start and end."""
         (t0, s0, q0), (t1, s1, q1) = start, end
-        # Seen by the weights, distance is one more colour.
-        q0, q1 = dr.fma(self.pixel.distance, t0, q0), dr.fma(self.pixel.distance, t1, q1)
+        far = self.pixel.distance
+        if far is not None:  # to the weights, distance is one more colour
+            q0, q1 = dr.fma(far, t0, q0), dr.fma(far, t1, q1)
         length = dr.fmax(t1 - t0, 0.0)
         g0, g1 = q0 * ray.transmittance, q1 * ray.transmittance
         w0, w1, transmittance, d_length, d_s0, d_s1 = self.scene.optics.adjoint(length, s0, s1, g0, g1, type(length)(0))
@@ -177,8 +182,10 @@ class _AdjointKernel:
         d_length = dr.select(t1 > t0, dr.fma(-half, s0 + s1, d_length), 0.0)
         d_s0, d_s1 = dr.fma(-half, length, d_s0), dr.fma(-half, length, d_s1)
         w0, w1 = w0 * ray.transmittance, w1 * ray.transmittance
-        at_start = [dr.fma(self.pixel.distance, w0, -d_length), d_s0, w0]
-        at_end = [dr.fma(self.pixel.distance, w1, d_length), d_s1, w1]
+        d_t0, d_t1 = -d_length, d_length
+        if far is not None:
+            d_t0, d_t1 = dr.fma(far, w0, d_t0), dr.fma(far, w1, d_t1)
+        at_start, at_end = [d_t0, d_s0, w0], [d_t1, d_s1, w1]
         return AdjointRay(ray.transmittance * transmittance, rest, ray.carry), at_start, at_end
 
     def _unclip(

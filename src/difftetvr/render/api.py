@@ -80,11 +80,12 @@ def render(
     task = MarchingTask(backend, mesh, camera, optics, per_cell, transmittance_threshold)
     vertices = camera.to_camera_space(mesh.vertices)
     color, density = field.color.to(backend.dtype), field.density.to(backend.dtype)
-    color, transmittance, distance = MarchingFunction.apply(task, vertices, color, density)
-    return _compose(color, transmittance, distance, background)
+    light, distance = MarchingFunction.apply(task, vertices, color, density)
+    return _compose(light, distance, background)
 
 
-def _compose(color: Any, transmittance: Any, distance: Any, background: Any) -> RenderedImage:
+def _compose(light: Any, distance: Any, background: Any) -> RenderedImage:
+    color, transmittance = light[..., :3], light[..., 3]
     if background is not None:
         behind = torch.as_tensor(background, dtype=color.dtype, device=color.device)
         if behind.shape != (3,):

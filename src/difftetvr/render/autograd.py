@@ -52,28 +52,34 @@ class MarchingTask:
 
 
 class MarchingFunction(torch.autograd.Function):
-    """(V, 3) camera-space vertices, colours and densities to (H, W, 3) radiance, (H, W) transmittance and distance."""
+    """(V, 3) camera-space vertices, colours, densities to (H, W, 4) radiance with transmittance, (H, W) distance."""
 
     @staticmethod
     def forward(ctx: Any, task: MarchingTask, vertices: Any, color: Any, density: Any) -> Any:
         """Render; keeps only the image and, while gradients are wanted, the uploaded scene."""
         scene = task.scene(vertices, color, density)
-        width, height = task.camera.width, task.camera.height
-        outputs = render_forward(scene)
-        shapes = ((height, width, 3), (height, width), (height, width))
-        image = tuple(task.backend.tensor(out, *shape) for out, shape in zip(outputs, shapes, strict=True))
+        light, distance = render_forward(scene)
+        size = (task.camera.height, task.camera.width)
+        image = task.backend.tensor(light, *size, 4), task.backend.tensor(distance, *size)
+        ctx.set_materialize_grads(False)
         ctx.task, ctx.scene, ctx.vertex_count = task, scene, vertices.shape[0]
         ctx.save_for_backward(*image)
         return image
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, g_color: Any, g_transmittance: Any, g_distance: Any) -> Any:
+    def backward(ctx: Any, g_light: Any, g_distance: Any) -> Any:
         """Walk again with the image's derivatives."""
         backend = ctx.task.backend
-        parts = [backend.floats(t) for t in (g_color, g_transmittance, g_distance, *ctx.saved_tensors)]
+        light, distance = ctx.saved_tensors
         needs_vertices, needs_color, needs_density = ctx.needs_input_grad[1:]
-        gradients = render_adjoint(ctx.scene, ImageAdjoint(*parts), ctx.vertex_count, needs_vertices)
+        image = ImageAdjoint(
+            backend.floats(torch.zeros_like(light) if g_light is None else g_light),
+            None if g_distance is None else backend.floats(g_distance),
+            backend.floats(light),
+            backend.floats(distance),
+        )
+        gradients = render_adjoint(ctx.scene, image, ctx.vertex_count, needs_vertices)
         field = backend.tensor(gradients.field).reshape(-1, 4)
         vertices = backend.tensor(gradients.vertices).reshape(-1, 4)[:, :3] if needs_vertices else None
         return None, vertices, field[:, :3] if needs_color else None, field[:, 3] if needs_density else None

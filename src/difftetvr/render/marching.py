@@ -184,11 +184,11 @@ class Clip:
         return [dr.fma(self.x, v1 - v0, v0) for v0, v1 in zip(entry, leaving, strict=True)]
 
 
-def render_forward(scene: MarchingScene) -> tuple[Any, Any, Any]:
+def render_forward(scene: MarchingScene) -> tuple[Any, Any]:
     """Render a view.
 
     Returns:
-        Flat arrays: (3 H W) premultiplied radiance, (H W) transmittance, (H W) integral of the distance.
+        Flat arrays: (H, W, 4) premultiplied radiance and transmittance, (H, W) integral of the distance.
     """
     backend = scene.backend
     real, pixels = backend.Float, scene.camera.width * scene.camera.height
@@ -215,10 +215,8 @@ def render_forward(scene: MarchingScene) -> tuple[Any, Any, Any]:
     lanes = dr.width(rays.pixel)
     start = Radiance([dr.zeros(real, lanes) for _ in range(3)], dr.zeros(real, lanes), dr.ones(real, lanes))
     ray = walk(scene, rays, read, visit, lambda face, ray, active: ray, start)
-    color, transmittance, distance = dr.empty(real, 3 * pixels), dr.empty(real, pixels), dr.empty(real, pixels)
-    for k in range(3):
-        dr.scatter(color, ray.color[k], 3 * rays.pixel + k, rays.valid)
-    dr.scatter(transmittance, ray.transmittance, rays.pixel, rays.valid)
+    light, distance = dr.empty(real, 4 * pixels), dr.empty(real, pixels)
+    dr.scatter(light, backend.Float4(*ray.color, ray.transmittance), rays.pixel, rays.valid)
     dr.scatter(distance, ray.distance, rays.pixel, rays.valid)
-    dr.eval(color, transmittance, distance)
-    return color, transmittance, distance
+    dr.eval(light, distance)
+    return light, distance
