@@ -1,0 +1,8 @@
+"""From images to a tetrahedral volume: losses, optimisation, checkpoints and metrics."""
+
+from difftetvr.fit.config import FitConfig
+from difftetvr.fit.errors import FitError
+from difftetvr.fit.loop import fit
+from difftetvr.fit.result import FitResult, Progress
+
+__all__ = ["FitConfig", "FitError", "FitResult", "Progress", "fit"]

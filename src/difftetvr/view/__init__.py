@@ -1,0 +1,1 @@
+"""Where results go: pictures, plots and tables."""

@@ -1,0 +1,356 @@
+"""The command line: ``difftetvr fit | render | eval | info | export``."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import torch
+import tyro
+from rich.console import Console
+from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, arg, subcommand
+
+from difftetvr.errors import DiffTetError
+from difftetvr.fit.config import FitConfig
+from difftetvr.fit.errors import FitError
+from difftetvr.fit.folder import RunFolder, write_json
+
+if TYPE_CHECKING:
+    from difftetvr.capture.capture import Capture
+    from difftetvr.mesh.field import Field
+    from difftetvr.mesh.tetmesh import TetMesh
+    from difftetvr.render.camera import Camera
+
+_USAGE_ERROR = 2
+_INTERRUPTED = 130
+_PROGRAM = "difftetvr"
+# Where the default camera stands, seen from the mesh: in front, to the right, a little above.
+_DEFAULT_DIRECTION = (0.45, -1.0, 0.35)
+
+Output = Annotated[Path, arg(aliases=["-o"])]
+
+
+@dataclass(frozen=True)
+class CaptureOptions:
+    """Views of a volume, for tooth and volume files; what is not given is as in the Tooth benchmark."""
+
+    transfer_function: str | None = None
+    """Transfer function of a volume, .json or .xml."""
+    shape: tuple[int, int, int] | None = None
+    """Samples along x, y and z of a .raw volume without a header."""
+    dtype: str | None = None
+    """NumPy type of a .raw volume without a header, such as uint8."""
+    spacing: tuple[float, float, float] | None = None
+    """Distances of samples along x, y and z; default: the file's."""
+    attenuation: float | None = None
+    """Density of opacity 1, where the box's longest side is 1."""
+    views: int | None = None
+    """Number of views."""
+    width: int | None = None
+    """Pixels of a view."""
+    height: int | None = None
+    """Pixels of a view."""
+    radius: float | None = None
+    """Distance of the cameras from the centre."""
+    orbit: Literal["fibonacci", "random"] | None = None
+    """Cameras on a spiral over the sphere, or at random places of it."""
+    test_every: int | None = None
+    """One of so many views is held out; 0: none."""
+
+    def load(self, name: str, console: Console) -> Capture:
+        """Reads or renders the capture of that name."""
+        from difftetvr.capture import load_capture
+
+        with console.status(f"Preparing the views of {name}"):
+            return load_capture(name, **dataclasses.asdict(self))
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Reconstruct a tetrahedral volume from images."""
+
+    capture: Annotated[str, Positional, arg(metavar="CAPTURE")]
+    """What to fit: tooth (the built-in CT scan), or the path of a volume or of a saved capture (.npz)."""
+    output: Output
+    """Folder for the model, its metrics, pictures and checkpoint."""
+    config: OmitArgPrefixes[FitConfig] = field(default_factory=FitConfig)
+    views_of: OmitArgPrefixes[CaptureOptions] = field(default_factory=CaptureOptions)
+    resume: bool = False
+    """Go on with the run in the output folder; options that are not given are taken from it."""
+    overwrite: bool = False
+    """Replace the run in the output folder."""
+
+    def run(self, console: Console) -> None:
+        """Fits, and fills the output folder."""
+        from difftetvr.fit.loop import fit
+        from difftetvr.fit.progress import ProgressDisplay
+        from difftetvr.view.report import write_report
+
+        folder = RunFolder(self.output)
+        self._require_same_run(folder)
+        folder.prepare(resume=self.resume, overwrite=self.overwrite)
+        capture = self.views_of.load(self.capture, console)
+        write_json(folder.config, self.to_json())
+        try:
+            with ProgressDisplay(console) as display:
+                result = fit(
+                    capture, self.config, checkpoint=folder.checkpoint, resume=self.resume, on_progress=display
+                )
+        except KeyboardInterrupt:
+            console.print(f"Interrupted; continue with: difftetvr fit {self.capture} -o {self.output} --resume")
+            raise
+        write_report(folder, result, capture)
+        _print_summary(console, result.metrics, folder)
+
+    def to_json(self) -> dict[str, Any]:
+        """The options that make the run what it is."""
+        views_of = {name: value for name, value in dataclasses.asdict(self.views_of).items() if value is not None}
+        return {"capture": self.capture, "capture_options": views_of, "fit": self.config.to_json()}
+
+    def with_saved_options(self, args: Sequence[str]) -> Fit:
+        """This command with the options of the run in the folder wherever ``args`` gives none."""
+        saved = RunFolder(self.output).read_config() if self.resume else None
+        if saved is None:
+            return self
+        return _parse(Fit, args, dataclasses.replace(self, **_saved_options(saved)))
+
+    def _require_same_run(self, folder: RunFolder) -> None:
+        saved = folder.read_config() if self.resume else None
+        if saved is None:
+            return
+        options = _saved_options(saved)
+        if options["capture"] != self.capture:
+            raise FitError(
+                f"The run in {self.output} fits '{options['capture']}', not '{self.capture}'; "
+                "resume with the same capture or choose another folder."
+            )
+        if options["views_of"] != self.views_of:
+            raise FitError(f"The run in {self.output} has other views; resume with the same options for them.")
+        options["config"].require_same_run(self.config)
+
+
+@dataclass(frozen=True)
+class Render:
+    """Render a picture of a reconstructed volume."""
+
+    model: Annotated[Path, Positional, arg(metavar="MODEL")]
+    """Mesh with color and density: .vtu, .vtk, .msh, .npz."""
+    output: Output
+    """The picture, .png."""
+    eye: tuple[float, float, float] | None = None
+    """Position of the camera; default: far enough away that the whole mesh is seen."""
+    target: tuple[float, float, float] | None = None
+    """Point in the middle of the picture; default: the centre of the mesh."""
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    """Direction that points upwards in the picture."""
+    fov: float = 53.13
+    """Vertical field of view in degrees."""
+    width: int = 512
+    """Pixels."""
+    height: int = 512
+    """Pixels."""
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Linear R G B behind the volume."""
+    device: str | None = None
+    """Where to render, such as cpu or cuda; default: the best that works."""
+
+    def run(self, console: Console) -> None:
+        """Renders and writes the picture."""
+        from difftetvr.render import render
+        from difftetvr.view.pictures import require_png, save_png
+
+        require_png(self.output)
+        mesh, field_on_mesh = _load_model(self.model, self.device)
+        with torch.no_grad():
+            image = render(mesh, field_on_mesh, self._camera(mesh), background=torch.tensor(self.background))
+        save_png(self.output, image.color)
+        console.print(f"Wrote {self.output} ({self.width} x {self.height})")
+
+    def _camera(self, mesh: TetMesh) -> Camera:
+        from difftetvr.render.camera import Camera
+
+        lower, upper = mesh.bounds().double().cpu()
+        target = torch.tensor(self.target, dtype=torch.float64) if self.target else 0.5 * (lower + upper)
+        eye = torch.tensor(self.eye, dtype=torch.float64) if self.eye else None
+        fov_y = math.radians(self.fov)
+        if eye is None:
+            direction = torch.tensor(_DEFAULT_DIRECTION, dtype=torch.float64)
+            narrow = 2.0 * math.atan(math.tan(0.5 * fov_y) * min(1.0, self.width / max(self.height, 1)))
+            radius = 0.5 * (upper - lower).norm()
+            eye = target + radius / max(math.sin(0.5 * narrow), 1e-6) * direction / direction.norm()
+        return Camera.look_at(eye, target, self.up, fov_y, self.width, self.height)
+
+
+@dataclass(frozen=True)
+class Eval:
+    """Compare a reconstructed volume with the held-out views of a capture."""
+
+    model: Annotated[Path, Positional, arg(metavar="MODEL")]
+    """Mesh with color and density."""
+    capture: Annotated[str, Positional, arg(metavar="CAPTURE")]
+    """tooth, or the path of a volume or of a saved capture (.npz)."""
+    output: Annotated[Path | None, arg(aliases=["-o"])] = None
+    """File to write the numbers to, JSON."""
+    all_views: bool = False
+    """Compare with the training views, too."""
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Linear R G B behind the volume."""
+    device: str | None = None
+    """Where to render."""
+    views_of: OmitArgPrefixes[CaptureOptions] = field(default_factory=CaptureOptions)
+
+    def run(self, console: Console) -> None:
+        """Renders the views and prints PSNR and SSIM of each."""
+        from difftetvr.fit.evaluation import evaluate
+        from difftetvr.view.describe import evaluation_table
+
+        mesh, field_on_mesh = _load_model(self.model, self.device)
+        capture = self.views_of.load(self.capture, console)
+        views = list(range(len(capture.cameras))) if self.all_views else capture.test_indices.tolist()
+        if not views:
+            raise FitError(f"'{capture.name}' holds out no views; compare with all of them with --all-views.")
+        evaluation = evaluate(mesh, field_on_mesh, capture, views, self.background)
+        console.print(evaluation_table(evaluation))
+        if self.output is not None:
+            write_json(self.output, evaluation.to_json())
+
+
+@dataclass(frozen=True)
+class Info:
+    """Describe a mesh or a capture."""
+
+    file: Annotated[str, Positional, arg(metavar="FILE")]
+    """A mesh (.vtu, .vtk, .msh, .mesh, .xdmf, .npz), a volume, a saved capture (.npz), or tooth."""
+    views_of: OmitArgPrefixes[CaptureOptions] = field(default_factory=CaptureOptions)
+
+    def run(self, console: Console) -> None:
+        """Prints tables."""
+        from difftetvr.view.describe import capture_table, mesh_tables
+
+        path = Path(self.file)
+        if _is_capture(path):
+            console.print(capture_table(self.file, self.views_of.load(self.file, console)))
+            return
+        from difftetvr.mesh.io import load_with_optional_field
+
+        for table in mesh_tables(self.file, *load_with_optional_field(path)):
+            console.print(table)
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write a reconstructed volume in another format."""
+
+    model: Annotated[Path, Positional, arg(metavar="MODEL")]
+    """Mesh with color and density."""
+    output: Annotated[Path, Positional, arg(metavar="OUT")]
+    """File to write: .vtu, .vtk, .msh or .npz."""
+
+    def run(self, console: Console) -> None:
+        """Reads and writes."""
+        from difftetvr.mesh.io import load, require_writable, save
+
+        require_writable(self.output)
+        mesh, field_on_mesh = load(self.model)
+        save(self.output, mesh, field_on_mesh)
+        console.print(f"Wrote {self.output} ({mesh.num_cells:,} cells)")
+
+
+Command = (
+    Annotated[Fit, subcommand("fit")]
+    | Annotated[Render, subcommand("render")]
+    | Annotated[Eval, subcommand("eval")]
+    | Annotated[Info, subcommand("info")]
+    | Annotated[Export, subcommand("export")]
+)
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Runs a command.
+
+    Args:
+        args: Arguments after the program's name; default: those of the process.
+
+    Returns:
+        The exit code: 0, 2 for bad input (one sentence on standard error), 130 when interrupted.
+    """
+    given = list(sys.argv[1:] if args is None else args)
+    try:
+        command: Any = _parse(Command, given)
+        if isinstance(command, Fit):
+            command = command.with_saved_options(given[1:])
+        command.run(Console())
+    except SystemExit as leave:
+        return leave.code if isinstance(leave.code, int) else _USAGE_ERROR
+    except DiffTetError as error:
+        return _fail(str(error))
+    except OSError as error:
+        return _fail(f"{error.strerror or error}{f': {error.filename}' if error.filename else ''}.")
+    except (MemoryError, torch.OutOfMemoryError):
+        return _fail("There is not enough memory; use fewer cells, or fewer or smaller views.")
+    except KeyboardInterrupt:
+        return _INTERRUPTED
+    return 0
+
+
+def _fail(sentence: str) -> int:
+    print(f"difftetvr: {sentence}", file=sys.stderr)
+    return _USAGE_ERROR
+
+
+def _parse(command: Any, args: Sequence[str], default: Any = tyro.MISSING) -> Any:
+    return tyro.cli(command, prog=_PROGRAM, args=args, default=default, config=(FlagCreatePairsOff,))
+
+
+def _print_summary(console: Console, metrics: dict[str, Any], folder: RunFolder) -> None:
+    quality = f"PSNR {metrics['psnr']:.2f} dB" if metrics["psnr"] is not None else "no held-out views"
+    if metrics["ssim"] is not None:
+        quality += f", SSIM {metrics['ssim']:.4f}"
+    lines = [
+        f"Held out: {quality} over {len(metrics['views'])} views",
+        f"{metrics['cells']:,} cells, {metrics['iterations']} iterations in {metrics['seconds']:.1f} s",
+        f"Model:    {folder.model}",
+        f"Pictures: {folder.comparison} and {folder.views}",
+        f"Curves:   {folder.curves}",
+    ]
+    console.print("\n".join(lines), highlight=False, soft_wrap=True)
+
+
+def _load_model(path: Path, device: str | None) -> tuple[TetMesh, Field]:
+    from difftetvr.fit.loop import resolve_device
+    from difftetvr.mesh.field import Field
+    from difftetvr.mesh.io import load
+
+    mesh, on_disk = load(path)
+    mesh = mesh.to(device=resolve_device(device))
+    color, density = (values.to(mesh.vertices.device) for values in (on_disk.color, on_disk.density))
+    return mesh, Field(color, density, location=on_disk.location)
+
+
+def _is_capture(path: Path) -> bool:
+    from difftetvr.capture.volume import is_volume_file
+    from difftetvr.capture.volume_capture import TOOTH
+    from difftetvr.mesh.io import is_mesh_archive
+
+    is_saved_capture = path.suffix.lower() == ".npz" and path.is_file() and not is_mesh_archive(path)
+    return str(path) == TOOTH or is_volume_file(path) or is_saved_capture
+
+
+def _saved_options(saved: dict[str, Any]) -> dict[str, Any]:
+    """Fields of :class:`Fit` from the saved options of a run."""
+    try:
+        views_of: dict[str, Any] = {
+            name: tuple(value) if isinstance(value, list) else value for name, value in saved["capture_options"].items()
+        }
+        return {
+            "capture": str(saved["capture"]),
+            "config": FitConfig.from_json(saved["fit"]),
+            "views_of": CaptureOptions(**views_of),
+        }
+    except (KeyError, TypeError, AttributeError) as error:
+        raise FitError(f"The saved options of the run are damaged ({error}); start anew with --overwrite.") from error

@@ -1,0 +1,184 @@
+"""Options of a reconstruction, and the schedules that follow from them."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from difftetvr.fit.errors import FitError
+
+Background = Literal["black", "white", "random"] | tuple[float, float, float]
+
+_CELLS_PER_CUBE = 6
+_BACKGROUND_STREAM = 1
+_BACKGROUND_COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+# Options that change nothing about where the optimisation goes: a resumed run may choose them anew.
+_FREE_OPTIONS = frozenset({"device", "evaluate_every", "checkpoint_seconds"})
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """How colours and densities are optimised on a fixed tetrahedral grid.
+
+    The defaults reconstruct the Tooth benchmark. Rates are steps of Adam per iteration in units of the quantity:
+    colours live in [0, 1], densities are counted in units of the capture's density (that of opacity 1 in a volume).
+    """
+
+    cells: int = 20_000
+    """Budget of tetrahedra; the grid nearest to it with near-cubic cubes is built over the capture's bounds."""
+    grid: tuple[int, int, int] | None = None
+    """Cubes along x, y and z; overrides --cells. Each cube holds 6 tetrahedra."""
+    location: Literal["vertex", "cell"] = "vertex"
+    """Whether colour and density belong to vertices, linear in between, or to cells, constant inside."""
+    iterations: int = 1000
+    """Number of optimisation steps."""
+    batch_views: int = 1
+    """Training views per step; their gradients are averaged."""
+    loss: Literal["l2", "l1"] = "l2"
+    """Mean squared (l2) or mean absolute (l1) difference of the images."""
+    rate: float = 0.03
+    """Learning rate of the first step."""
+    final_rate: float = 0.001
+    """Learning rate of the last step; in between it falls log-linearly."""
+    betas: tuple[float, float] = (0.9, 0.99)
+    """Decay of Adam's first and second moments."""
+    background: Background = "black"
+    """Behind the volume: black, white, random in every step, or linear R G B. All but black need images with alpha."""
+    haze_penalty: float = 0.01
+    """Pull towards zero density, in mean absolute density gradients; removes fog that no training view can refute."""
+    initial_color: float = 0.5
+    """Colour that all vertices start with, in [0, 1]."""
+    initial_density: float = 0.05
+    """Density that all vertices start with, in units of the capture's density."""
+    seed: int = 0
+    """Seed of the order of the views and of random backgrounds."""
+    device: str | None = None
+    """Where to run, such as cpu, cuda or mps; default: the best that works."""
+    evaluate_every: int = 100
+    """Iterations between glances at a few held-out views, for the curves only; 0: never."""
+    checkpoint_seconds: float = 30.0
+    """Seconds between checkpoints."""
+
+    def __post_init__(self) -> None:
+        for name, least in (("cells", 1), ("iterations", 1), ("batch_views", 1), ("evaluate_every", 0), ("seed", 0)):
+            _require(getattr(self, name) >= least, name, getattr(self, name), f"at least {least}")
+        for name in ("rate", "final_rate"):
+            _require(_positive(getattr(self, name)), name, getattr(self, name), "greater than 0 and finite")
+        for name in ("haze_penalty", "initial_density", "checkpoint_seconds"):
+            value = getattr(self, name)
+            _require(value >= 0 and math.isfinite(value), name, value, "at least 0 and finite")
+        _require(0 <= self.initial_color <= 1, "initial_color", self.initial_color, "between 0 and 1")
+        _require(all(0 <= b < 1 for b in self.betas), "betas", self.betas, "at least 0 and less than 1")
+        _require(self.location in ("vertex", "cell"), "location", self.location, "vertex or cell")
+        _require(self.loss in ("l1", "l2"), "loss", self.loss, "l1 or l2")
+        _require(self.grid is None or min(self.grid) >= 1, "grid", self.grid, "at least 1 cube along each axis")
+        named = isinstance(self.background, str)
+        valid = self.background in ("black", "white", "random") if named else _is_color(self.background)
+        _require(valid, "background", self.background, "black, white, random or three values in [0, 1]")
+
+    @property
+    def needs_alpha(self) -> bool:
+        """Whether training images must be composited over something that is not black."""
+        return self.background not in ("black", (0.0, 0.0, 0.0))
+
+    def rate_at(self, iteration: int) -> float:
+        """Learning rate of a step, log-linear from ``rate`` (iteration 0) to ``final_rate`` (the last one)."""
+        fraction = iteration / max(self.iterations - 1, 1)
+        return self.rate * (self.final_rate / self.rate) ** fraction
+
+    def views_at(self, iteration: int, view_count: int) -> list[int]:
+        """Positions, in [0, view_count), of the training views of a step.
+
+        The views are shuffled anew in each pass over them. The order is a function of seed and iteration alone, so a
+        resumed run sees the views that an uninterrupted one would have seen.
+        """
+        first = iteration * self.batch_views
+        return [self._view(k, view_count) for k in range(first, first + self.batch_views)]
+
+    def background_at(self, iteration: int) -> tuple[float, float, float]:
+        """Linear RGB background of a step; like the views a function of seed and iteration alone."""
+        if self.background != "random":
+            return self.evaluation_background()
+        r, g, b = np.random.default_rng([self.seed, _BACKGROUND_STREAM, iteration]).random(3)
+        return float(r), float(g), float(b)
+
+    def evaluation_background(self) -> tuple[float, float, float]:
+        """Background of held-out images: the given one, black where training uses random ones."""
+        if isinstance(self.background, str):
+            return _BACKGROUND_COLORS.get(self.background, _BACKGROUND_COLORS["black"])
+        return self.background
+
+    def require_same_run(self, other: FitConfig) -> None:
+        """Checks that ``other`` would take the same steps as these options of a saved run.
+
+        Raises:
+            FitError: An option that decides the steps differs; names the first one.
+        """
+        for item in dataclasses.fields(self):
+            mine, theirs = getattr(self, item.name), getattr(other, item.name)
+            if item.name not in _FREE_OPTIONS and mine != theirs:
+                raise FitError(
+                    f"The saved run has {item.name} = {mine}, this run asks for {theirs}; "
+                    "resume with the same options or start anew."
+                )
+
+    def to_json(self) -> dict[str, Any]:
+        """The options as JSON values."""
+        return dataclasses.asdict(self)
+
+    @staticmethod
+    def from_json(values: dict[str, Any]) -> FitConfig:
+        """The inverse of :meth:`to_json`.
+
+        Raises:
+            FitError: An option is unknown or out of range.
+        """
+        known = {item.name for item in dataclasses.fields(FitConfig)}
+        unknown = sorted(set(values) - known)
+        if unknown:
+            raise FitError(f"The saved options hold '{unknown[0]}', which this version does not know; start anew.")
+        options: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+        return FitConfig(**options)
+
+    def _view(self, position: int, view_count: int) -> int:
+        epoch, offset = divmod(position, view_count)
+        return int(np.random.default_rng([self.seed, 0, epoch]).permutation(view_count)[offset])
+
+
+def grid_cubes(cells: int, extent: Sequence[float]) -> tuple[int, int, int]:
+    """Cubes along each axis of the Kuhn grid whose number of tetrahedra is nearest to a budget.
+
+    Only grids whose boxes are nearly cubes compete: those that come from dividing each side of the box by one edge
+    length and rounding.
+
+    Args:
+        cells: Budget of tetrahedra, >= 1.
+        extent: (3,) sides of the box, in any unit, > 0.
+    """
+    sides = np.asarray(extent, dtype=np.float64)
+    edge = (sides.prod() * _CELLS_PER_CUBE / cells) ** (1 / 3)
+    edges = edge * np.exp(np.linspace(-0.5, 0.5, 2001))
+    candidates = np.maximum(1, np.rint(sides / edges[:, None])).astype(np.int64)
+    error = np.abs(candidates.prod(axis=1) * _CELLS_PER_CUBE - cells)
+    # Among equals the one whose edge is closest to that of exact cubes.
+    best = np.lexsort((np.abs(np.log(edges / edge)), error))[0]
+    nx, ny, nz = (int(n) for n in candidates[best])
+    return nx, ny, nz
+
+
+def _require(condition: bool, name: str, value: object, rule: str) -> None:
+    if not condition:
+        raise FitError(f"The option {name} is {value}; it must be {rule}.")
+
+
+def _positive(value: float) -> bool:
+    return value > 0 and math.isfinite(value)
+
+
+def _is_color(value: object) -> bool:
+    return isinstance(value, tuple) and len(value) == 3 and all(0.0 <= v <= 1.0 for v in value)

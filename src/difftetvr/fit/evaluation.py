@@ -1,0 +1,100 @@
+"""How well a reconstruction shows views: images, PSNR and SSIM."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from difftetvr.capture.capture import Capture
+from difftetvr.errors import CaptureError
+from difftetvr.fit.metrics import SSIM_WINDOW, psnr, ssim
+from difftetvr.mesh.field import Field
+from difftetvr.mesh.tetmesh import TetMesh
+from difftetvr.render import render
+
+Color = tuple[float, float, float]
+BLACK: Color = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Image quality per view.
+
+    Attributes:
+        views: Indices of the views in the capture.
+        psnr: PSNR in dB of each.
+        ssim: SSIM of each; empty where the images are smaller than its window of 11 x 11 pixels.
+    """
+
+    views: list[int]
+    psnr: list[float]
+    ssim: list[float]
+
+    @property
+    def mean_psnr(self) -> float | None:
+        """Mean over the views of the PSNR in dB; None without views."""
+        return sum(self.psnr) / len(self.psnr) if self.psnr else None
+
+    @property
+    def mean_ssim(self) -> float | None:
+        """Mean over the views of the SSIM; None without values."""
+        return sum(self.ssim) / len(self.ssim) if self.ssim else None
+
+    def to_json(self) -> dict[str, Any]:
+        """Means as ``psnr`` and ``ssim``, and the values of each of ``views``."""
+        return {
+            "psnr": self.mean_psnr,
+            "ssim": self.mean_ssim,
+            "views": self.views,
+            "psnr_per_view": self.psnr,
+            "ssim_per_view": self.ssim,
+        }
+
+
+def true_image(capture: Capture, view: int, background: Color = BLACK) -> torch.Tensor:
+    """(H, W, 3) image of a view over a background, on the CPU.
+
+    Raises:
+        CaptureError: The background is not black and the capture knows no alpha.
+    """
+    image = capture.images[view]
+    if background == BLACK:
+        return image
+    if capture.alphas is None:
+        raise CaptureError(
+            f"The images of '{capture.name}' have no alpha, so they cannot be put over the background {background}; "
+            "use a black background."
+        )
+    return image + (1.0 - capture.alphas[view])[..., None] * torch.tensor(background)
+
+
+@torch.no_grad()
+def rendered_image(mesh: TetMesh, field: Field, capture: Capture, view: int, background: Color = BLACK) -> torch.Tensor:
+    """(H, W, 3) image of the reconstruction from the camera of a view, on the CPU."""
+    behind = torch.tensor(background, device=mesh.vertices.device)
+    return render(mesh, field, capture.cameras[view], background=behind).color.cpu()
+
+
+def evaluate(
+    mesh: TetMesh, field: Field, capture: Capture, views: Sequence[int], background: Color = BLACK
+) -> Evaluation:
+    """Renders views and compares them with the truth.
+
+    Args:
+        mesh: The reconstruction's mesh, on any device.
+        field: Its colours and densities.
+        capture: Cameras and true images.
+        views: Indices of the views to compare.
+        background: Linear RGB behind the volume.
+    """
+    psnrs, ssims = [], []
+    for view in views:
+        truth = true_image(capture, view, background)
+        image = rendered_image(mesh, field, capture, view, background)
+        psnrs.append(psnr(image, truth))
+        if min(truth.shape[:2]) >= SSIM_WINDOW:
+            ssims.append(ssim(image, truth))
+    return Evaluation(list(views), psnrs, ssims)

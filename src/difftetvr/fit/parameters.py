@@ -1,0 +1,92 @@
+"""The quantities that a reconstruction optimises."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+
+from difftetvr.fit.config import FitConfig
+from difftetvr.mesh.field import Field
+from difftetvr.mesh.tetmesh import TetMesh
+
+_NAMES = ("color", "density")
+# Gradients of a mean over pixels shrink as cells and pixels do; Adam's usual 1e-8 would drown those of fine meshes.
+_EPSILON = 1e-15
+
+
+class FieldParameters:
+    """Colours and densities on a fixed mesh, with their Adam optimiser.
+
+    Density is stored in units of the capture's typical density, so that one learning rate fits scenes of any size.
+    After each step the parameters are projected to the valid ranges, colours to [0, 1] and densities to [0, inf):
+    unlike under an exponential or softplus, empty space reaches a density of exactly 0.
+
+    Attributes:
+        color: (N, 3) leaf tensor, linear RGB; N vertices or cells.
+        density: (N,) leaf tensor in units of ``density_unit``.
+        density_unit: Density per unit length that a parameter of 1 stands for.
+        location: ``"vertex"`` or ``"cell"``, what the N entries belong to.
+    """
+
+    def __init__(self, mesh: TetMesh, config: FitConfig, density_unit: float) -> None:
+        count = mesh.num_vertices if config.location == "vertex" else mesh.num_cells
+        device = mesh.vertices.device
+        self.location = config.location
+        self.density_unit = density_unit
+        self.color = torch.full((count, 3), config.initial_color, device=device).requires_grad_()
+        self.density = torch.full((count,), config.initial_density, device=device).requires_grad_()
+        self._optimizer = torch.optim.Adam(
+            [self.color, self.density], lr=config.rate, betas=config.betas, eps=_EPSILON, fused=True
+        )
+
+    def field(self) -> Field:
+        """The field that the parameters stand for, differentiable in them."""
+        return Field(self.color, self.density_unit * self.density, location=self.location)
+
+    def detached_field(self) -> Field:
+        """A copy of the field as it is now, without gradients."""
+        color, density = self.color.detach().clone(), self.density_unit * self.density.detach()
+        return Field(color, density, location=self.location)
+
+    def zero_grad(self) -> None:
+        """Forgets the gradients before the views of a step are accumulated."""
+        self._optimizer.zero_grad(set_to_none=True)
+
+    def step(self, rate: float, haze_penalty: float) -> None:
+        """One projected Adam step with the accumulated gradients.
+
+        Args:
+            rate: Learning rate.
+            haze_penalty: This many mean absolute density gradients are added to every density gradient. Where images
+                say something they drown it; fog that no image can tell from the background decays.
+        """
+        for group in self._optimizer.param_groups:
+            group["lr"] = rate
+        if haze_penalty and self.density.grad is not None:
+            self.density.grad += haze_penalty * self.density.grad.abs().mean()
+        self._optimizer.step()
+        with torch.no_grad():
+            self.color.clamp_(0.0, 1.0)
+            self.density.clamp_(min=0.0)
+
+    def state(self) -> dict[str, torch.Tensor]:
+        """Parameters and optimiser state by name: all that the next step depends on."""
+        tensors = dict(self._items())
+        for name, parameter in self._items():
+            for key, value in self._optimizer.state.get(parameter, {}).items():
+                tensors[f"{name}.{key}"] = value
+        return tensors
+
+    def restore(self, tensors: dict[str, torch.Tensor]) -> None:
+        """The inverse of :meth:`state`."""
+        with torch.no_grad():
+            for name, parameter in self._items():
+                parameter.copy_(tensors[name])
+                prefix = f"{name}."
+                saved = {k.removeprefix(prefix): v.clone() for k, v in tensors.items() if k.startswith(prefix)}
+                if saved:
+                    self._optimizer.state[parameter] = {k: v.to(parameter.device) for k, v in saved.items()}
+
+    def _items(self) -> Iterator[tuple[str, torch.Tensor]]:
+        return ((name, getattr(self, name)) for name in _NAMES)

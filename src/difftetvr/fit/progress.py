@@ -1,0 +1,75 @@
+"""Progress on the terminal: a live bar, or plain lines where the output is no terminal."""
+
+from __future__ import annotations
+
+import time
+from types import TracebackType
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn
+from rich.text import Text
+
+from difftetvr.fit.result import Progress as Status
+
+_LINE_SECONDS = 5.0
+
+
+class ProgressDisplay:
+    """Shows iteration, loss, PSNR, cells, speed and time left; a context manager to be passed as ``on_progress``.
+
+    Args:
+        console: Where to print; default: standard output.
+    """
+
+    def __init__(self, console: Console | None = None) -> None:
+        self._console = console or Console()
+        columns = (BarColumn(bar_width=24), TextColumn("{task.fields[status]}"))
+        self._bar = Progress(*columns, console=self._console) if self._console.is_terminal else None
+        self._task = self._bar.add_task("", total=None, status=Text("starting")) if self._bar else None
+        self._begin: tuple[float, int] | None = None
+        self._line_due = 0.0
+
+    def __enter__(self) -> ProgressDisplay:
+        if self._bar:
+            self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._bar:
+            self._bar.stop()
+
+    def __call__(self, status: Status) -> None:
+        """Shows a new status."""
+        now = time.monotonic()
+        if self._begin is None:
+            # The first iteration compiles kernels; the speed is that of those after it.
+            self._begin = (now, status.iteration)
+        elapsed, done = now - self._begin[0], status.iteration - self._begin[1]
+        speed = done / elapsed if elapsed > 0 and done else None
+        if self._bar and self._task is not None:
+            text = Text(_describe(status, speed))
+            self._bar.update(self._task, completed=status.iteration, total=status.iterations, status=text)
+        elif now >= self._line_due or status.iteration == status.iterations:
+            self._line_due = now + _LINE_SECONDS
+            self._console.print(_describe(status, speed), highlight=False, soft_wrap=True)
+
+
+def _describe(status: Status, speed: float | None) -> str:
+    held_out = f" (held out {status.held_out_psnr:.2f})" if status.held_out_psnr is not None else ""
+    parts = [
+        f"{status.iteration}/{status.iterations}",
+        f"loss {status.loss:.2e}",
+        f"PSNR {status.train_psnr:.2f} dB{held_out}",
+        f"{status.cells:,} cells",
+    ]
+    if speed is not None:
+        parts += [f"{speed:.1f} it/s", f"{_clock((status.iterations - status.iteration) / speed)} left"]
+    return "  ".join(parts)
+
+
+def _clock(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"

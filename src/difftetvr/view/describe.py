@@ -1,0 +1,94 @@
+"""Descriptions of meshes, captures and results as tables for the terminal."""
+
+from __future__ import annotations
+
+import torch
+from rich.table import Table
+
+from difftetvr.capture.capture import Capture
+from difftetvr.fit.evaluation import Evaluation
+from difftetvr.mesh.field import Field
+from difftetvr.mesh.tetmesh import TetMesh
+
+_QUALITY_BINS = 10
+_BAR_WIDTH = 30
+
+
+def mesh_tables(name: str, mesh: TetMesh, field: Field | None) -> list[Table]:
+    """Size, bounds and attributes of a mesh, and the histogram of its cells' quality Q.
+
+    Args:
+        name: Title, such as the file's name.
+        mesh: The mesh.
+        field: Its colours and densities, if it has any.
+    """
+    lower, upper = mesh.bounds().tolist()
+    boundary = mesh.topology.boundary_faces.shape[0]
+    table = _table(name)
+    table.add_row("cells", f"{mesh.num_cells:,}")
+    table.add_row("vertices", f"{mesh.num_vertices:,}")
+    table.add_row("boundary faces", f"{boundary:,}")
+    table.add_row("bounds", f"{_point(lower)} to {_point(upper)}")
+    table.add_row("volume", f"{float(mesh.volumes().double().sum()):.6g}")
+    if field is None:
+        table.add_row("attributes", "none (geometry only)")
+    else:
+        location = field.location_on(mesh)
+        table.add_row("color", f"per {location}, {_range(field.color)}")
+        table.add_row("density", f"per {location}, {_range(field.density)} per unit length")
+    return [table, _quality_table(mesh)]
+
+
+def capture_table(name: str, capture: Capture) -> Table:
+    """Number and size of the images, split and bounds of a capture."""
+    count, height, width, _ = capture.images.shape
+    lower, upper = capture.bounds.tolist()
+    table = _table(name)
+    table.add_row("views", f"{count} ({len(capture.train_indices)} training, {len(capture.test_indices)} held out)")
+    table.add_row("image size", f"{width} x {height}")
+    table.add_row("alpha", "known" if capture.alphas is not None else "unknown")
+    table.add_row("bounds", f"{_point(lower)} to {_point(upper)}")
+    table.add_row("density unit", f"{capture.density_unit:g} per unit length")
+    return table
+
+
+def evaluation_table(evaluation: Evaluation) -> Table:
+    """PSNR and SSIM per view, and their means."""
+    table = Table()
+    for column in ("view", "PSNR (dB)", "SSIM"):
+        table.add_column(column, justify="right")
+    ssims = [f"{value:.4f}" for value in evaluation.ssim] or ["-"] * len(evaluation.views)
+    for view, psnr, ssim in zip(evaluation.views, evaluation.psnr, ssims, strict=True):
+        table.add_row(str(view), f"{psnr:.2f}", ssim)
+    mean_ssim = "-" if evaluation.mean_ssim is None else f"{evaluation.mean_ssim:.4f}"
+    if evaluation.mean_psnr is not None:
+        table.add_section()
+        table.add_row("mean", f"{evaluation.mean_psnr:.2f}", mean_ssim)
+    return table
+
+
+def _quality_table(mesh: TetMesh) -> Table:
+    quality = mesh.quality().detach().double().cpu()
+    counts = torch.histc(quality.clamp(0, 1), _QUALITY_BINS, 0.0, 1.0).long().tolist()
+    table = Table(title=f"quality Q: least {quality.min():.3g}, mean {quality.mean():.3g}", title_justify="left")
+    for column in ("Q", "cells", ""):
+        table.add_column(column, justify="left" if not column else "right")
+    for i, count in enumerate(counts):
+        bar = "█" * round(_BAR_WIDTH * count / max(counts))
+        table.add_row(f"{i / _QUALITY_BINS:.1f} - {(i + 1) / _QUALITY_BINS:.1f}", f"{count:,}", bar)
+    return table
+
+
+def _table(title: str) -> Table:
+    table = Table(title=title, title_justify="left", show_header=False)
+    table.add_column(style="bold")
+    table.add_column(overflow="fold")
+    return table
+
+
+def _point(values: list[float]) -> str:
+    return "(" + ", ".join(f"{v:.4g}" for v in values) + ")"
+
+
+def _range(values: torch.Tensor) -> str:
+    return f"{float(values.min()):.4g} to {float(values.max()):.4g}"

@@ -1,0 +1,62 @@
+"""The output folder of a finished reconstruction: model, numbers, curves and pictures."""
+
+from __future__ import annotations
+
+from difftetvr.capture.capture import Capture
+from difftetvr.errors import CaptureError
+from difftetvr.fit.evaluation import rendered_image, true_image
+from difftetvr.fit.folder import RunFolder, write_json
+from difftetvr.fit.result import FitResult
+from difftetvr.mesh.io import save
+from difftetvr.view.pictures import save_comparisons, save_png
+from difftetvr.view.plots import save_curves
+
+_COMPARED_VIEWS = 4
+_SINGLE_VIEWS = 16
+
+
+def write_report(folder: RunFolder, result: FitResult, capture: Capture) -> None:
+    """Writes everything that a run leaves behind; the metrics come last, so they stand for a complete folder.
+
+    Pictures show held-out views, or training views of a capture that holds none out.
+
+    Args:
+        folder: Existing folder.
+        result: The finished reconstruction.
+        capture: The images that it was made from.
+
+    Raises:
+        MeshError: The model cannot be written.
+        CaptureError: A picture cannot be written.
+        FitError: The curves or the metrics cannot be written.
+    """
+    save(folder.model, result.mesh, result.field)
+    save_curves(folder.curves, result.history)
+    _write_pictures(folder, result, capture)
+    write_json(folder.metrics, {"capture": capture.name, **result.metrics})
+
+
+def _write_pictures(folder: RunFolder, result: FitResult, capture: Capture) -> None:
+    background = result.config.evaluation_background()
+    views = _spread(capture.test_indices.tolist() or capture.train_indices.tolist(), _SINGLE_VIEWS)
+    compared = _spread(views, _COMPARED_VIEWS)
+    rows = []
+    try:
+        folder.views.mkdir(exist_ok=True)
+    except OSError as error:
+        raise CaptureError(f"The folder {folder.views} cannot be created ({error.strerror}); free it.") from error
+    for view in views:
+        truth = true_image(capture, view, background)
+        image = rendered_image(result.mesh, result.field, capture, view, background)
+        save_png(folder.views / f"{view:04d}_truth.png", truth)
+        save_png(folder.views / f"{view:04d}_reconstruction.png", image)
+        if view in compared:
+            rows.append((f"truth, view {view}", truth, image))
+    save_comparisons(folder.comparison, rows)
+
+
+def _spread(views: list[int], count: int) -> list[int]:
+    """At most ``count`` of the views, evenly spread."""
+    if len(views) <= count:
+        return views
+    return [views[i * len(views) // count] for i in range(count)]
