@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from oracle import OracleImage, render_oracle
+from oracle.oracle import OracleImage, render_oracle
 from scipy.spatial import Delaunay
 from torch import Tensor
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-import mpmath
+import mpmath  # type: ignore[import-untyped]
 import numpy as np
 import pytest
 import torch
-from oracle import barycentric_functions, find_crossings, pixel_directions, quadrature, render_oracle
-from scenes import (
+from oracle.oracle import barycentric_functions, find_crossings, pixel_directions, quadrature, render_oracle
+from oracle.scenes import (
     EXTREME_SCENES,
     SCENES,
     Scene,
@@ -162,7 +162,7 @@ def test_cells_of_a_ray_agree_with_locating_points(name: str) -> None:
     t = (torch.arange(steps, dtype=torch.float64) + 0.5) * (far / steps)
     background = torch.zeros(3) if scene.background is None else scene.background
     alpha = image.alpha.ravel()
-    for pixel in torch.linspace(0, len(alpha) - 1, 6).long().tolist() + [int(alpha.argmax())]:
+    for pixel in [*torch.linspace(0, len(alpha) - 1, 6).long().tolist(), int(alpha.argmax())]:
         points = t[:, None] * pixel_directions(scene.camera)[pixel]
         weights = offset + torch.einsum("nj,tkj->ntk", points, slope)
         inside, cell = weights.amin(-1).max(dim=1)
