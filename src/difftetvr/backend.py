@@ -12,10 +12,14 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-import drjit as dr
 import torch
 
 from difftetvr.errors import BackendError
+from difftetvr.libllvm import tell_drjit
+
+tell_drjit()  # before the first import of Dr.Jit, which looks for libLLVM only then
+
+import drjit as dr  # noqa: E402
 
 _DEVICE_BACKENDS = {"cpu": "llvm", "cuda": "cuda", "mps": "metal"}
 _DTYPES = {torch.float32: "", torch.float64: "64"}
@@ -55,11 +59,16 @@ class Backend:
         return self.dtype == torch.float64
 
     def floats(self, tensor: torch.Tensor) -> Any:
-        """Flat Dr.Jit view of a floating-point tensor, without a copy if it is contiguous and of this precision."""
+        """Flat Dr.Jit view of a floating-point tensor, without a copy if it is contiguous and of this precision.
+
+        Whoever launches a kernel on the view waits for it, with :meth:`tensor`, before the view may go away.
+        """
+        self._await_torch()
         return self.Float(tensor.detach().to(self.dtype).contiguous().reshape(-1))
 
     def uints(self, tensor: torch.Tensor) -> Any:
-        """Flat Dr.Jit view of an int32 tensor as unsigned integers: -1 becomes 0xFFFFFFFF."""
+        """Flat Dr.Jit view of an int32 tensor as unsigned integers, likewise: -1 becomes 0xFFFFFFFF."""
+        self._await_torch()
         return self.UInt(tensor.detach().to(torch.int32).contiguous().reshape(-1).view(torch.uint32))
 
     def opaque(self, value: float) -> Any:
@@ -71,11 +80,16 @@ class Backend:
         return dr.opaque(self.UInt, int(value))
 
     def tensor(self, array: Any, *shape: int) -> torch.Tensor:
-        """PyTorch tensor over a Dr.Jit array's memory, without a copy."""
+        """PyTorch tensor over a Dr.Jit array's memory, without a copy; waits for all kernels launched so far."""
         dr.eval(array)
         dr.sync_thread()
         tensor = array.torch()
         return tensor.reshape(shape) if shape else tensor
+
+    def _await_torch(self) -> None:
+        # Torch and Dr.Jit run on streams of their own.
+        if self.name == "cuda":
+            torch.cuda.current_stream(self.device).synchronize()
 
 
 def backend_for(tensor: torch.Tensor) -> Backend:
@@ -124,12 +138,11 @@ def default_device() -> torch.device:
     Raises:
         BackendError: None works.
     """
-    for device in ("cuda", "mps", "cpu"):
-        available = {"cuda": torch.cuda.is_available, "mps": torch.backends.mps.is_available}.get(device, lambda: True)
+    present = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available(), "cpu": True}
+    for device in (name for name, here in present.items() if here):
         try:
-            if available():
-                get_backend(device)
-                return torch.device(device)
+            get_backend(device)
+            return torch.device(device)
         except BackendError:
             continue
     raise BackendError(_missing_backend("llvm"))

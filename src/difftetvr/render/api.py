@@ -53,7 +53,8 @@ def render(
         background: (3,) linear RGB behind the volume; black if None.
         renderer: How crossings are found and ordered; ``"marching"``.
         optics: Optical model of one cell; exact integration of the linear field if None.
-        transmittance_threshold: Rays stop once their transmittance is at or below this value, in [0, 1); 0 stops none early.
+        transmittance_threshold: Rays stop once their transmittance is at or below this value, in [0, 1); 0 stops none
+            before it vanishes.
 
     Returns:
         The image, on the device of ``mesh.vertices``.
@@ -72,7 +73,7 @@ def render(
     for name, tensor in (("color", field.color), ("density", field.density)):
         if tensor.device != mesh.vertices.device:
             raise MeshError(
-                f"The field's {name} is on '{tensor.device}' but the mesh on '{mesh.vertices.device}'; move one of them."
+                f"The field's {name} is on '{tensor.device}', the mesh on '{mesh.vertices.device}'; move one of them."
             )
     backend = backend_for(mesh.vertices)
     if optics is None:

@@ -69,7 +69,12 @@ class Camera:
 
     @staticmethod
     def look_at(
-        eye: Vector, target: Vector, up: Vector = (0.0, 0.0, 1.0), fov_y: float = 0.927, width: int = 512, height: int = 512
+        eye: Vector,
+        target: Vector,
+        up: Vector = (0.0, 0.0, 1.0),
+        fov_y: float = 0.927,
+        width: int = 512,
+        height: int = 512,
     ) -> Camera:
         """Camera at ``eye`` that looks at ``target``, with square pixels and a centred principal point.
 

@@ -20,7 +20,9 @@ from difftetvr.render.camera import Camera
 from difftetvr.render.rays import Pinhole, pixel_frame
 from difftetvr.render.walk import Corner, find_exit, holds_ray, interpolate, make_face
 
-_INSIDE_TOLERANCE = 1e-5  # of a barycentric coordinate: a camera on a face, edge or vertex counts as inside every cell there
+_INSIDE_TOLERANCE = (
+    1e-5  # of a barycentric coordinate: a camera on a face, edge or vertex counts as inside every cell there
+)
 
 
 @dataclass
@@ -37,7 +39,7 @@ class EntryTable:
 
         def build() -> EntryTable:
             topology = mesh.topology
-            # Counter-clockwise from outside is clockwise in the ray's plane, whose axes a, b, direction are right-handed.
+            # Counter-clockwise from outside is clockwise in the ray's plane: a, b, direction are right-handed.
             corners = topology.boundary_faces[:, [0, 2, 1]].contiguous()
             cells = topology.boundary_cells.contiguous()
             apices = (mesh.tets[cells.long()].sum(dim=1) - corners.sum(dim=1)).to(torch.int32)
@@ -113,7 +115,9 @@ def find_entries(backend: Backend, mesh: TetMesh, camera_vertices: torch.Tensor,
     around = _cells_around_camera(backend, mesh, camera_vertices)
     if around is not None:
         inner = EntryTable.of_cells(mesh, around)
-        table = EntryTable(*(torch.cat([getattr(t, n) for t in (table, inner)]) for n in ("corners", "cells", "apices")))
+        table = EntryTable(
+            *(torch.cat([getattr(t, n) for t in (table, inner)]) for n in ("corners", "cells", "apices"))
+        )
     scene = _Scene(
         backend,
         camera,
@@ -147,22 +151,19 @@ def _cells_around_camera(backend: Backend, mesh: TetMesh, camera_vertices: torch
         index = dr.gather(backend.UInt, tets, 4 * cell + k)
         points.append([dr.gather(backend.Float, vertices, 3 * index + axis) for axis in range(3)])
 
-    def triple(p: list[Any], q: list[Any], r: list[Any]) -> Any:
-        return (
-            p[0] * (q[1] * r[2] - q[2] * r[1])
-            + p[1] * (q[2] * r[0] - q[0] * r[2])
-            + p[2] * (q[0] * r[1] - q[1] * r[0])
-        )
-
-    volumes = [-triple(points[i], points[j], points[k]) for i, j, k in LOCAL_FACES]
-    # Outward faces see the origin at a negative volume when it is inside.
-    sign_fixed = [-volume for volume in volumes]
-    total = sign_fixed[0] + sign_fixed[1] + sign_fixed[2] + sign_fixed[3]
-    inside = backend.Bool(True)
-    for volume in sign_fixed:
+    # The camera is the origin: a face seen from outside its cell spans a negative volume with a camera inside.
+    volumes = [-_triple(points[i], points[j], points[k]) for i, j, k in LOCAL_FACES]
+    total = volumes[0] + volumes[1] + volumes[2] + volumes[3]
+    inside = total > 0
+    for volume in volumes:
         inside &= volume >= -_INSIDE_TOLERANCE * total
-    found = dr.compress(inside & (total > 0))
-    return None if len(found) == 0 else backend.tensor(backend.Int(found)).to(torch.int32)
+    found = dr.compress(inside)
+    return None if dr.width(found) == 0 else backend.tensor(backend.Int(found))
+
+
+def _triple(p: list[Any], q: list[Any], r: list[Any]) -> Any:
+    """Six times the signed volume of the origin and three points."""
+    return p[0] * (q[1] * r[2] - q[2] * r[1]) + p[1] * (q[2] * r[0] - q[0] * r[2]) + p[2] * (q[0] * r[1] - q[1] * r[0])
 
 
 def _start_rows(scene: _Scene, begin: int, end: int) -> Any:
@@ -181,7 +182,11 @@ def _start_rows(scene: _Scene, begin: int, end: int) -> Any:
         better = holds_ray(face) & (exit_t > farthest)
         return row + 1, dr.select(better, row, best), dr.select(better, exit_t, farthest)
 
-    state = (uint(backend.opaque_uint(begin)) + dr.zeros(uint, dr.width(pixel)), none + dr.zeros(uint, dr.width(pixel)), dr.zeros(real, dr.width(pixel)))
+    state = (
+        uint(backend.opaque_uint(begin)) + dr.zeros(uint, dr.width(pixel)),
+        none + dr.zeros(uint, dr.width(pixel)),
+        dr.zeros(real, dr.width(pixel)),
+    )
     _, best, _ = dr.while_loop(state, lambda row, best, farthest: row < last, body)
     dr.eval(best)
     return best
@@ -304,7 +309,7 @@ def _fill_lists(scene: _Scene, items: _WorkItems | None, lists: EntryLists, star
 
 
 def _sort_lists(scene: _Scene, lists: EntryLists, rows: Any, depths: Any) -> Any:
-    """Each pixel's rows ordered by (depth, row): an entry's place is the number of smaller ones; the lists are short."""
+    """Each pixel's rows by (depth, row): an entry's place is the number of smaller ones, for the lists are short."""
     uint, real = scene.backend.UInt, scene.backend.Float
     end = lists.offset + lists.count
     ordered = dr.zeros(uint, dr.width(rows))

@@ -36,8 +36,8 @@ class MarchingScene:
         backend: Array types.
         camera: Image size (the intrinsics are read from the device).
         optics: Optical model of one cell.
-        vertices: Vertex records: (V, 4) x, y, z in camera space and 0 for per-cell fields, else (V, 8) x, y, z, density,
-            linear RGB and 0, so that one cache line holds all of a vertex.
+        vertices: Vertex records: (V, 4) x, y, z in camera space and 0 for per-cell fields, else (V, 8) x, y, z,
+            density, linear RGB and 0, so that one cache line holds all of a vertex.
         cells: (T, 4) linear RGB and density for per-cell fields, else None.
         table: Walk table, see :func:`difftetvr.render.walk.walk_table`.
         entries: Entry lists of this view.

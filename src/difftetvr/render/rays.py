@@ -54,13 +54,11 @@ class Frame:
 
     def project(self, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
         """Coordinates (a, b, t) of a camera-space point; explicit fma, so that every kernel rounds alike."""
-        return tuple(dr.fma(e[0], x, dr.fma(e[1], y, e[2] * z)) for e in (self.a, self.b, self.direction))  # type: ignore[return-value]
+        return tuple(dr.fma(e[0], x, dr.fma(e[1], y, e[2] * z)) for e in (self.a, self.b, self.direction))
 
     def to_camera_space(self, a: Any, b: Any, t: Any) -> tuple[Any, Any, Any]:
         """A vector given in this frame, in camera space."""
-        return tuple(
-            dr.fma(self.a[k], a, dr.fma(self.b[k], b, self.direction[k] * t)) for k in range(3)
-        )  # type: ignore[return-value]
+        return tuple(dr.fma(self.a[k], a, dr.fma(self.b[k], b, self.direction[k] * t)) for k in range(3))
 
 
 def pixel_frame(pinhole: Pinhole, column: Any, row: Any) -> Frame:
