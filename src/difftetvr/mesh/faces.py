@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
 
 from difftetvr.errors import MeshError
+from difftetvr.mesh.arrays import chunks, put, sort_keys, true_indices
 
 LOCAL_FACES = ((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1))
 """Local vertices of the face opposite local vertex k, counter-clockwise seen from outside a positive cell."""
 
 MAX_CELLS = 2**29 - 1
-"""Half-faces 4 * cell + k are int32."""
+"""Largest number of cells: half-faces 4 * cell + k and incidence offsets fit int32."""
 
 _KEY_BITS = 63
 _HASH_FACTORS = (-7046029254386353131, -4417276706812531889)
@@ -22,51 +22,20 @@ _LOCAL_FACE_BITS = 2
 
 @dataclass(frozen=True)
 class FaceMatching:
-    """Cells paired across their faces. A half-face is 4 * cell + k, the face opposite local vertex k as that cell sees it.
+    """Cells paired across their faces.
+
+    A half-face is 4 * cell + k, the face opposite local vertex k as that cell sees it.
 
     Attributes:
         cell_adjacency: (T, 4) int32, the cell across the face opposite local vertex k, or -1 on the boundary.
         crowded: (N,) int64 half-faces of faces that more than two cells share; empty in a valid mesh.
-        folded: (N, 2) int64 pairs of half-faces with the same winding: both cells lie on the same side; empty in a valid
-            mesh of positive cells.
+        folded: (N, 2) int64 pairs of half-faces with the same winding: both cells lie on the same side; empty in a
+            valid mesh of positive cells.
     """
 
     cell_adjacency: torch.Tensor
     crowded: torch.Tensor
     folded: torch.Tensor
-
-
-def chunks(count: int, device: torch.device) -> Iterator[slice]:
-    """Slices that cover range(count), small enough for a CPU's cache and for temporaries not to matter.
-
-    Args:
-        count: Number of elements.
-        device: Where the elements are; accelerators get larger slices.
-
-    Yields:
-        Consecutive slices.
-    """
-    # 2**15 elements stay in the L2 cache and below torch's threshold for threads: in-cache arithmetic on one core beats
-    # memory-bound arithmetic on many, and by far when others use the cores too.
-    size = 2**15 if device.type == "cpu" else 2**23
-    for start in range(0, count, size):
-        yield slice(start, min(start + size, count))
-
-
-def sort_keys(keys: torch.Tensor) -> torch.Tensor:
-    """Sort 1-D int64 keys ascending; on the CPU in place.
-
-    Args:
-        keys: (N,) int64, contiguous.
-
-    Returns:
-        (N,) int64 sorted keys.
-    """
-    if keys.device.type != "cpu":
-        return torch.sort(keys).values
-    # numpy sorts keys alone with SIMD, ten times faster than torch, which always carries the permutation along.
-    keys.numpy().sort()
-    return keys
 
 
 def match_faces(tets: torch.Tensor, num_vertices: int) -> FaceMatching:
@@ -94,20 +63,21 @@ def match_faces(tets: torch.Tensor, num_vertices: int) -> FaceMatching:
         # Two more than the chunk: a pair may straddle its end, and so may three equal faces.
         half_faces = keys[part.start : part.stop + 2] & id_mask
         face, odd = _sorted_faces(tets, half_faces)
-        equal = (face[0][1:] == face[0][:-1]) & (face[1][1:] == face[1][:-1]) & (face[2][1:] == face[2][:-1])
+        equal = torch.ones_like(odd[1:])
+        for vertex in face:
+            equal &= vertex[1:] == vertex[:-1]
         size = part.stop - part.start
         three = equal[1:] & equal[:-1]
         if three.any():
-            first = torch.nonzero(three).squeeze(1)
+            first = true_indices(three)
             crowded.append(half_faces[torch.stack((first, first + 1, first + 2))].flatten())
-        left = torch.nonzero(equal[:size]).squeeze(1)
-        right = left + 1
-        same_winding = odd[left] == odd[right]
-        left, right = half_faces[left], half_faces[right]
+        left = true_indices(equal[:size])
+        same_winding = odd.index_select(0, left) == odd.index_select(0, left + 1)
+        left, right = half_faces.index_select(0, left), half_faces.index_select(0, left + 1)
         if same_winding.any():
             folded.append(torch.stack((left[same_winding], right[same_winding]), 1))
-        flat_adjacency[left] = (right >> _LOCAL_FACE_BITS).int()
-        flat_adjacency[right] = (left >> _LOCAL_FACE_BITS).int()
+        put(flat_adjacency, left, (right >> _LOCAL_FACE_BITS).int())
+        put(flat_adjacency, right, (left >> _LOCAL_FACE_BITS).int())
     none = keys.new_empty(0)
     return FaceMatching(
         adjacency,
@@ -131,8 +101,8 @@ def check_matching(matching: FaceMatching, tets: torch.Tensor) -> None:
         sharing = matching.crowded[_same_face(tets, matching.crowded, first)]
         cells = ", ".join(str(c) for c in (sharing >> _LOCAL_FACE_BITS).tolist()[:8])
         raise MeshError(
-            f"Cell {int(first) >> _LOCAL_FACE_BITS}: its face {_face_text(tets, first)} is shared by {sharing.numel()} cells "
-            f"({cells}), but at most two cells can meet at a face; remove duplicate or overlapping cells."
+            f"Cell {int(first) >> _LOCAL_FACE_BITS}: its face {_face_text(tets, first)} is shared by {sharing.numel()} "
+            f"cells ({cells}), but at most two cells can meet at a face; remove duplicate or overlapping cells."
         )
     if matching.folded.numel():
         pair = matching.folded[matching.folded.min(1).values.argmin()]
@@ -153,8 +123,7 @@ def face_vertices(tets: torch.Tensor, half_faces: torch.Tensor) -> torch.Tensor:
     Returns:
         (N, 3) vertex indices of tets' dtype.
     """
-    corners = torch.tensor(LOCAL_FACES, device=tets.device)[half_faces & 3]
-    return torch.take(tets, corners + (half_faces & ~3)[:, None])
+    return torch.stack(_face_columns(tets, half_faces), 1)
 
 
 def _half_face_keys(tets: torch.Tensor, num_vertices: int, id_bits: int) -> torch.Tensor:
@@ -163,7 +132,7 @@ def _half_face_keys(tets: torch.Tensor, num_vertices: int, id_bits: int) -> torc
     hash_mask = (1 << hash_bits) - 1
     keys = torch.empty((4, tets.shape[0]), dtype=torch.int64, device=tets.device)
     for part in chunks(tets.shape[0], tets.device):
-        corners = tets[part].t().contiguous()
+        corners = [column.contiguous() for column in tets[part].unbind(1)]
         first_half_face = torch.arange(4 * part.start, 4 * part.stop, 4, device=tets.device)
         for k, local in enumerate(LOCAL_FACES):
             (low, middle, high), _ = _sort_three(*(corners[i] for i in local))
@@ -179,7 +148,7 @@ def _separate_hash_collisions(keys: torch.Tensor, tets: torch.Tensor, id_bits: i
     members = []
     for part in chunks(keys.shape[0], keys.device):
         group = keys[part.start : part.stop + 2] >> id_bits
-        starts = torch.nonzero(group[2:] == group[:-2]).squeeze(1) + part.start
+        starts = true_indices(group[2:] == group[:-2]) + part.start
         members.append(torch.cat((starts, starts + 1, starts + 2)))
     positions = torch.unique(torch.cat(members))
     if not positions.numel():
@@ -191,9 +160,18 @@ def _separate_hash_collisions(keys: torch.Tensor, tets: torch.Tensor, id_bits: i
     keys[positions] = suspects[by_face[by_group]]
 
 
+def _face_columns(tets: torch.Tensor, half_faces: torch.Tensor) -> list[torch.Tensor]:
+    opposite = half_faces & 3
+    first = half_faces - opposite
+    flat = tets.view(-1)
+    corners = torch.tensor(LOCAL_FACES, device=tets.device).t().contiguous()
+    places = [column.index_select(0, opposite).add_(first) for column in corners]
+    return [flat.index_select(0, place) for place in places]
+
+
 def _sorted_faces(tets: torch.Tensor, half_faces: torch.Tensor) -> tuple[tuple[torch.Tensor, ...], torch.Tensor]:
     """Ascending vertices of half-faces, and whether sorting them took an odd permutation."""
-    return _sort_three(*face_vertices(tets, half_faces).t().contiguous())
+    return _sort_three(*_face_columns(tets, half_faces))
 
 
 def _sort_three(

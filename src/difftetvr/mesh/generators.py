@@ -40,15 +40,16 @@ def grid(
         with c = i + nx (j + ny k).
 
     Raises:
-        MeshError: A size is no positive integer, the box is empty or not finite, the mesh would be too large, or the cubes
-            are too small for the precision of dtype.
+        MeshError: A size is no positive integer, the box is empty or not finite, the mesh would be too large, or the
+            cubes are too small for the precision of dtype.
     """
     if len(shape) != 3 or any(int(n) != n or n < 1 for n in shape):
         raise MeshError(f"The grid's shape is {tuple(shape)}; pass three numbers of cubes, each at least 1.")
     nx, ny, nz = (int(n) for n in shape)
     if 6 * nx * ny * nz > MAX_CELLS or (nx + 1) * (ny + 1) * (nz + 1) > _MAX_VERTICES:
         raise MeshError(f"A grid of {nx} x {ny} x {nz} cubes has more than {MAX_CELLS} cells; pass fewer cubes.")
-    axes = [_axis(name, *ends, dtype, device) for name, *ends in zip("xyz", lower, upper, (nx, ny, nz), strict=True)]
+    counts = (nx, ny, nz)
+    axes = [_axis("xyz"[i], float(lower[i]), float(upper[i]), counts[i], dtype).to(device) for i in range(3)]
     z, y, x = torch.meshgrid(*reversed(axes), indexing="ij")
     vertices = torch.stack((x, y, z), -1).view(-1, 3)
 
@@ -59,16 +60,14 @@ def grid(
     return vertices, tets.view(-1, 4)
 
 
-def _axis(
-    name: str, lower: float, upper: float, count: int, dtype: torch.dtype, device: torch.device | str | None
-) -> torch.Tensor:
+def _axis(name: str, lower: float, upper: float, count: int, dtype: torch.dtype) -> torch.Tensor:
     if not (math.isfinite(lower) and math.isfinite(upper) and lower < upper):
         raise MeshError(f"The grid's box goes from {lower} to {upper} along {name}; pass finite ends, lower < upper.")
-    ticks = torch.linspace(lower, upper, count + 1, dtype=torch.float64).to(dtype=dtype, device=device)
+    ticks = torch.linspace(lower, upper, count + 1, dtype=torch.float64).to(dtype)
     if not (ticks[1:] > ticks[:-1]).all():
         raise MeshError(
-            f"{dtype} cannot tell apart {count + 1} positions from {lower} to {upper} along {name}; pass fewer cubes, a "
-            "box closer to the origin, or dtype=torch.float64."
+            f"{dtype} cannot tell apart {count + 1} positions from {lower} to {upper} along {name}; pass fewer cubes, "
+            "a box closer to the origin, or dtype=torch.float64."
         )
     return ticks
 
@@ -76,11 +75,10 @@ def _axis(
 def _kuhn_cells(steps: tuple[int, int, int]) -> list[list[int]]:
     """Vertex indices of a cube's six positive cells relative to its lowest corner."""
     cells = []
-    for first, second, third in itertools.permutations(range(3)):
+    for first, second, _ in itertools.permutations(range(3)):
         path = [0, steps[first], steps[first] + steps[second], sum(steps)]
         is_odd = (second - first) % 3 != 1
         if is_odd:
             path[2], path[3] = path[3], path[2]
         cells.append(path)
-        del third
     return cells

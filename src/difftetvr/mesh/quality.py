@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 import torch
 
-from difftetvr.mesh.faces import chunks
+from difftetvr.mesh.arrays import chunks
 from difftetvr.mesh.topology import LOCAL_EDGES
 
 _REGULAR_TETRAHEDRON = 6.0 * 2.0**0.5
@@ -81,7 +81,8 @@ def _per_cell(
         return measure(_corners(vertices, tets)).to(vertices.dtype)
     # Converting once and not per slice: the positions are an order of magnitude fewer than the gathered corners.
     positions = vertices.detach().double()
-    results = [measure(_corners(positions, tets[part])).to(vertices.dtype) for part in chunks(len(tets), tets.device)]
+    slices = chunks(len(tets), tets.device, width=12)
+    results = [measure(_corners(positions, tets[part])).to(vertices.dtype) for part in slices]
     return torch.cat(results) if results else measure(_corners(positions, tets)).to(vertices.dtype)
 
 
@@ -110,7 +111,7 @@ def _altitudes(corners: torch.Tensor) -> torch.Tensor:
 
 
 def _quality(corners: torch.Tensor) -> torch.Tensor:
-    (a, b, c), unit = _unit_edges(corners)
+    (a, b, c), _ = _unit_edges(corners)
     points = torch.stack((torch.zeros_like(a), a, b, c))
     squares = torch.stack([(points[j] - points[i]).square().sum(1) for i, j in LOCAL_EDGES])
     volume = (a * torch.linalg.cross(b, c)).sum(1) / 6.0

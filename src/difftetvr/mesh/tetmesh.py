@@ -9,6 +9,7 @@ import torch
 
 from difftetvr.errors import MeshError
 from difftetvr.mesh import generators, quality, validation
+from difftetvr.mesh.arrays import true_indices
 from difftetvr.mesh.topology import Topology
 
 
@@ -35,13 +36,13 @@ class TetMesh:
         zero only if it is exactly zero for the positions as stored, so thin cells pass and the unit of length is free.
 
         Args:
-            vertices: (V, 3) positions, array-like. A float32 or float64 tensor is kept as it is, autograd graph included;
-                lists and other dtypes become float32.
+            vertices: (V, 3) positions, array-like. A float32 or float64 tensor is kept as it is, autograd graph
+                included; lists and other dtypes become float32.
             tets: (T, 4) integer vertex indices, array-like; copied.
 
         Raises:
-            MeshError: Names the first offending cell: index out of range, vertex not finite, repeated vertex, zero volume,
-                face shared by three cells, cells that overlap their neighbour. Also for wrong shapes and dtypes.
+            MeshError: Names the first offending cell: index out of range, vertex not finite, repeated vertex, zero
+                volume, face shared by three cells, overlap with a neighbour. Also for wrong shapes and dtypes.
         """
         points = validation.as_vertices(vertices)
         cells = validation.as_tets(tets, points.shape[0], points.device)
@@ -55,7 +56,7 @@ class TetMesh:
 
     @classmethod
     def from_valid(cls, vertices: torch.Tensor, topology: Topology) -> TetMesh:
-        """Wrap arrays that are known to make a valid mesh, unchecked: for code that changes meshes and keeps them valid.
+        """Wrap what is known to make a valid mesh, unchecked: for code that changes meshes and keeps them valid.
 
         Kernels gather unchecked, so an index out of range here reads foreign memory.
 
@@ -164,12 +165,12 @@ class TetMesh:
         """Drop the vertices that no cell uses.
 
         Returns:
-            The mesh with the remaining vertices in their old order (this mesh where all are used), and their old indices,
-            (V',) int64, with which per-vertex values are picked: `color[kept]`.
+            The mesh with the remaining vertices in their old order (this mesh where all are used), and their old
+            indices, (V',) int64, with which per-vertex values are picked: `color[kept]`.
         """
         used = torch.zeros(self.num_vertices, dtype=torch.bool, device=self.tets.device)
         used[self.tets.reshape(-1)] = True
-        kept = torch.nonzero(used).squeeze(1)
+        kept = true_indices(used)
         if kept.numel() == self.num_vertices:
             return self, kept
         renumbered = used.cumsum(0, dtype=torch.int32) - 1
@@ -198,7 +199,8 @@ class TetMesh:
 
     def __repr__(self) -> str:
         """Sizes, precision and device."""
-        return f"TetMesh({self.num_vertices} vertices, {self.num_cells} cells, {self.vertices.dtype}, {self.vertices.device})"
+        sizes = f"{self.num_vertices} vertices, {self.num_cells} cells"
+        return f"TetMesh({sizes}, {self.vertices.dtype}, {self.vertices.device})"
 
     def _assign(self, vertices: torch.Tensor, topology: Topology) -> None:
         self.vertices = vertices
@@ -208,6 +210,6 @@ class TetMesh:
 
 def _orient(tets: torch.Tensor, signs: torch.Tensor) -> None:
     """Swap the last two vertices of negative cells, in place."""
-    negative = torch.nonzero(signs < 0).squeeze(1)
+    negative = true_indices(signs < 0)
     if negative.numel():
         tets[negative] = tets[negative][:, [0, 1, 3, 2]]

@@ -7,7 +7,8 @@ from typing import Any, TypeVar
 
 import torch
 
-from difftetvr.mesh.faces import LOCAL_FACES, check_matching, chunks, face_vertices, match_faces, sort_keys
+from difftetvr.mesh.arrays import chunks, sort_keys, true_indices
+from difftetvr.mesh.faces import LOCAL_FACES, check_matching, face_vertices, match_faces
 
 __all__ = ["LOCAL_EDGES", "LOCAL_FACES", "Topology"]
 
@@ -23,8 +24,8 @@ X = TypeVar("X")
 class Topology:
     """Who neighbours whom in a tetrahedral mesh: no positions, only indices.
 
-    Every table is built on first use, kept, and lies on the device of `tets`; treat all of them as read-only. Meshes that
-    differ in vertex positions alone share one `Topology`.
+    Every table is built on first use, kept, and lies on the device of `tets`; treat all of them as read-only. Meshes
+    that differ in vertex positions alone share one `Topology`.
 
     Attributes:
         tets: (T, 4) int32 vertex indices of positively oriented cells.
@@ -101,7 +102,7 @@ class Topology:
         """
         if key not in self._tables:
             self._tables[key] = build()
-        return self._tables[key]  # type: ignore[no-any-return]
+        return self._tables[key]
 
     def to(self, device: torch.device | str) -> Topology:
         """The same topology on another device; the adjacency comes along, other tables are rebuilt there on demand.
@@ -136,24 +137,24 @@ class Topology:
 
     def _build_face_table(self) -> tuple[torch.Tensor, torch.Tensor]:
         faces, face_cells = [], []
-        for part in chunks(self.num_cells, self.tets.device):
+        for part in chunks(self.num_cells, self.tets.device, width=4):
             neighbours = self.cell_adjacency[part]
             cells = torch.arange(part.start, part.stop, dtype=torch.int32, device=neighbours.device)[:, None]
             # Of the two half-faces of an inner face, the one of the smaller cell stands for it.
-            half_faces = torch.nonzero(((neighbours < 0) | (neighbours > cells)).view(-1)).squeeze(1)
-            others = neighbours.reshape(-1)[half_faces]
+            half_faces = true_indices(((neighbours < 0) | (neighbours > cells)).view(-1))
+            others = neighbours.reshape(-1).index_select(0, half_faces)
             half_faces += 4 * part.start
             faces.append(face_vertices(self.tets, half_faces))
             face_cells.append(torch.stack(((half_faces >> 2).int(), others), 1))
         return torch.cat(faces), torch.cat(face_cells)
 
     def _build_boundary(self) -> tuple[torch.Tensor, torch.Tensor]:
-        half_faces = torch.nonzero((self.cell_adjacency < 0).view(-1)).squeeze(1)
+        half_faces = true_indices((self.cell_adjacency < 0).view(-1))
         return face_vertices(self.tets, half_faces), (half_faces >> 2).int()
 
     def _build_edges(self) -> torch.Tensor:
         parts = []
-        for part in chunks(self.num_cells, self.tets.device):
+        for part in chunks(self.num_cells, self.tets.device, width=6):
             ordered = self.tets[part].sort(1).values.long()
             keys = torch.cat([(ordered[:, i] << _ROW_BITS) | ordered[:, j] for i, j in LOCAL_EDGES])
             parts.append(torch.unique_consecutive(sort_keys(keys)))
@@ -162,10 +163,9 @@ class Topology:
 
     def _build_vertex_cells(self) -> tuple[torch.Tensor, torch.Tensor]:
         keys = torch.empty((self.num_cells, 4), dtype=torch.int64, device=self.tets.device)
-        offsets = torch.zeros(self.num_vertices + 1, dtype=torch.int64, device=self.tets.device)
-        for part in chunks(self.num_cells, self.tets.device):
+        for part in chunks(self.num_cells, self.tets.device, width=4):
             cells = torch.arange(part.start, part.stop, device=self.tets.device)[:, None]
             keys[part] = (self.tets[part].long() << _ROW_BITS) | cells
-            offsets[1:] += torch.bincount(self.tets[part].reshape(-1), minlength=self.num_vertices)
-        keys = sort_keys(keys.view(-1))
-        return offsets.cumsum(0).int(), (keys & _ROW_MASK).int()
+        cells = sort_keys(keys.view(-1)).bitwise_and_(_ROW_MASK).int()
+        counts = torch.bincount(self.tets.view(-1), minlength=self.num_vertices)
+        return torch.nn.functional.pad(counts.cumsum(0), (1, 0)).int(), cells

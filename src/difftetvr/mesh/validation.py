@@ -9,7 +9,8 @@ import numpy as np
 import torch
 
 from difftetvr.errors import MeshError
-from difftetvr.mesh.faces import MAX_CELLS, chunks
+from difftetvr.mesh.arrays import chunks, true_indices
+from difftetvr.mesh.faces import MAX_CELLS
 
 _SIGN_CERTAIN = 2.0**-48
 """|det| above this times the product of the edge lengths has a certain sign in float64.
@@ -59,7 +60,7 @@ def as_tets(tets: Any, num_vertices: int, device: torch.device) -> torch.Tensor:
         raise MeshError(f"The cells' vertex indices are {tensor.dtype}; pass integers.")
     if not 1 <= tensor.shape[0] <= MAX_CELLS:
         raise MeshError(f"The mesh has {tensor.shape[0]} cells; pass at least 1 and at most {MAX_CELLS}.")
-    for part in chunks(tensor.shape[0], tensor.device):
+    for part in chunks(tensor.shape[0], tensor.device, width=4):
         outside = (tensor[part] < 0) | (tensor[part] >= num_vertices)
         if outside.any():
             row, column = torch.nonzero(outside)[0].tolist()
@@ -119,7 +120,7 @@ def orientations(vertices: torch.Tensor, tets: torch.Tensor) -> torch.Tensor:
         # "not greater" also catches the NaN that nothing finite should make.
         unsure = ~(determinant.abs() > _SIGN_CERTAIN * bound)
         if unsure.any():
-            uncertain.append(torch.nonzero(unsure).squeeze(1) + part.start)
+            uncertain.append(true_indices(unsure) + part.start)
     if uncertain:
         cells = torch.cat(uncertain)
         signs[cells] = _exact_signs(positions, tets[cells]).to(signs.device)
@@ -139,7 +140,7 @@ def check_not_flat(vertices: torch.Tensor, tets: torch.Tensor, signs: torch.Tens
     Raises:
         MeshError: Names the first flat cell and says whether it repeats a vertex or two of its vertices coincide.
     """
-    flat = torch.nonzero(signs == 0).squeeze(1)
+    flat = true_indices(signs == 0)
     if not flat.numel():
         return
     cell = int(flat[0])
@@ -147,11 +148,9 @@ def check_not_flat(vertices: torch.Tensor, tets: torch.Tensor, signs: torch.Tens
     names = "(" + ", ".join(str(v) for v in corners) + ")"
     repeated = next((v for v in corners if corners.count(v) > 1), None)
     if repeated is not None:
-        raise MeshError(
-            f"Cell {cell}: it uses vertex {repeated} twice {names}; give each cell four different vertices."
-        )
+        raise MeshError(f"Cell {cell}: it uses vertex {repeated} twice {names}; give it four different vertices.")
     raise MeshError(
-        f"Cell {cell}: its volume is zero, as its vertices {names} lie in one plane; remove such cells or move a vertex."
+        f"Cell {cell}: its volume is zero, as its vertices {names} lie in one plane; remove the cell or move a vertex."
     )
 
 
@@ -168,7 +167,7 @@ def check_positive(vertices: torch.Tensor, tets: torch.Tensor) -> None:
     check_finite(vertices, tets)
     signs = orientations(vertices, tets)
     check_not_flat(vertices, tets, signs)
-    inverted = torch.nonzero(signs < 0).squeeze(1)
+    inverted = true_indices(signs < 0)
     if inverted.numel():
         raise MeshError(
             f"Cell {int(inverted[0])}: the vertex positions turn it inside out ({inverted.numel()} such cells in all); "
@@ -192,8 +191,8 @@ def _as_tensor(values: Any, what: str) -> torch.Tensor:
 
 
 def _determinants(axes: torch.Tensor, tets: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """det of the edges from the first vertex, and the product of their lengths; axes is (3, V) float64."""
-    corners = tets.t().contiguous()
+    """Determinant of the edges from the first vertex, and the product of their lengths; axes is (3, V) float64."""
+    corners = [column.contiguous() for column in tets.unbind(1)]
     origin = [axis.index_select(0, corners[0]) for axis in axes]
     edges = [[axis.index_select(0, corners[k]).sub_(o) for axis, o in zip(axes, origin)] for k in (1, 2, 3)]
     (ax, ay, az), (bx, by, bz), (cx, cy, cz) = edges

@@ -1,0 +1,73 @@
+"""Array primitives for tables of millions of rows, for tensors of any device.
+
+On the CPU they work on one core, slice by slice in its cache. Torch would start its threads for many of these small
+operations, and waiting for threads costs a thousand times the work where other processes use the cores too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+
+
+def chunks(count: int, device: torch.device, width: int = 1) -> Iterator[slice]:
+    """Slices that cover range(count), small enough for a CPU's cache and for temporaries not to matter.
+
+    Args:
+        count: Number of rows.
+        device: Where the rows are; accelerators get larger slices.
+        width: Elements of a row in the largest temporary.
+
+    Yields:
+        Consecutive slices.
+    """
+    # 30 000 is just below torch's usual threshold for threads, 2**15 elements.
+    size = max((30_000 if device.type == "cpu" else 2**25) // width, 1)
+    for start in range(0, count, size):
+        yield slice(start, min(start + size, count))
+
+
+def sort_keys(keys: torch.Tensor) -> torch.Tensor:
+    """Sort keys ascending; on the CPU in place.
+
+    Args:
+        keys: (N,) int64, contiguous.
+
+    Returns:
+        (N,) int64 sorted keys.
+    """
+    if keys.device.type != "cpu":
+        return torch.sort(keys).values
+    # numpy sorts keys alone with SIMD, ten times faster than torch, which always carries the permutation along.
+    keys.numpy().sort()
+    return keys
+
+
+def true_indices(mask: torch.Tensor) -> torch.Tensor:
+    """Positions of the true elements of a mask.
+
+    Args:
+        mask: (N,) bool.
+
+    Returns:
+        (M,) int64, ascending.
+    """
+    if mask.device.type != "cpu":
+        return torch.nonzero(mask).squeeze(1)
+    return torch.from_numpy(np.flatnonzero(mask.numpy()))
+
+
+def put(target: torch.Tensor, indices: torch.Tensor, values: torch.Tensor) -> None:
+    """Write target[indices] = values in place, outside autograd.
+
+    Args:
+        target: (N,) contiguous.
+        indices: (M,) int64, all different.
+        values: (M,) of target's dtype.
+    """
+    if target.device.type != "cpu":
+        target[indices] = values
+    else:
+        target.numpy()[indices.numpy()] = values.numpy()
