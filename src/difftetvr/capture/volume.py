@@ -45,7 +45,7 @@ class Volume:
         object.__setattr__(self, "values", values)
         if values.ndim != 3 or min(values.shape) < 2:
             raise CaptureError(
-                f"The volume '{self.name}' has shape {values.shape[::-1]}; it needs 2 samples or more on each of 3 axes."
+                f"The volume '{self.name}' has shape {values.shape[::-1]}; give at least 2 samples along 3 axes."
             )
         if values.size > MAX_SAMPLES:
             raise CaptureError(

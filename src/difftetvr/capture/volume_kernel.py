@@ -109,16 +109,16 @@ def enter_box(
 
 
 def march(b: Backend, tables: VolumeTables, rays: Rays) -> tuple[Any, Any, Any, Any]:
-    """Premultiplied radiance (red, green, blue) over black, and transmittance, by the mid-point rule.
+    """Premultiplied radiance (red, green, blue) over black, and alpha, by the mid-point rule.
 
     Every step has the colour and the attenuation coefficient of its middle: the scalar is interpolated trilinearly
     there and then classified by the transfer function. Empty blocks are stepped over; steps keep their places.
     """
 
-    def running(k: Any, check: Any, red: Any, green: Any, blue: Any, transmittance: Any) -> Any:
-        return (k < rays.count) & (transmittance > TRANSMITTANCE_THRESHOLD)
+    def running(k: Any, check: Any, light: Any) -> Any:
+        return (k < rays.count) & (light[3] > TRANSMITTANCE_THRESHOLD)
 
-    def advance(k: Any, check: Any, red: Any, green: Any, blue: Any, transmittance: Any) -> tuple[Any, ...]:
+    def advance(k: Any, check: Any, light: Any) -> tuple[Any, Any, Any]:
         middle = b.Float(k) + 0.5
         point = _three(dr.fma(middle, rays.step[axis], rays.origin[axis]) for axis in range(3))
         k, check = dr.if_stmt(
@@ -127,25 +127,30 @@ def march(b: Backend, tables: VolumeTables, rays: Rays) -> tuple[Any, Any, Any, 
             lambda k, check: _skip_empty(b, tables, rays, k, point),
             lambda k, check: (k, check),
         )
-        red, green, blue, transmittance = dr.if_stmt(
-            (red, green, blue, transmittance),
+        light = dr.if_stmt(
+            (light,),
             k < check,
-            lambda *light: _composite(b, tables, rays, point, light),
-            lambda *light: light,
+            lambda light: _composite(b, tables, rays, point, light),
+            lambda light: light,
         )
-        return dr.select(k < check, k + 1, k), check, red, green, blue, transmittance
+        return dr.select(k < check, k + 1, k), check, light
 
-    start = (b.UInt(0), b.UInt(0), b.Float(0), b.Float(0), b.Float(0), b.Float(1))
-    _, _, red, green, blue, transmittance = dr.while_loop(start, running, advance, label="march_volume")
-    return red, green, blue, transmittance
+    light = (b.Float(0), b.Float(0), b.Float(0), b.Float(1), b.Float(0))
+    _, _, light = dr.while_loop((b.UInt(0), b.UInt(0), light), running, advance, label="march_volume")
+    red, green, blue, transmittance, lost = light
+    return red, green, blue, dr.fmin(dr.fmax((1.0 - transmittance) - lost, 0.0), 1.0)
 
 
-def _composite(b: Backend, tables: VolumeTables, rays: Rays, point: Any, light: Any) -> tuple[Any, Any, Any, Any]:
-    red, green, blue, transmittance = light
+def _composite(b: Backend, tables: VolumeTables, rays: Rays, point: Any, light: Any) -> tuple[Any, ...]:
+    """Light (red, green, blue, transmittance, what rounding has cut from the transmittance) behind one more step."""
+    red, green, blue, transmittance, lost = light
     color, attenuation = _classify(b, tables, _trilinear(b, tables, *point))
     weight = transmittance * _opacity(attenuation * rays.length)
     red, green, blue = dr.fma(weight, color[0], red), dr.fma(weight, color[1], green), dr.fma(weight, color[2], blue)
-    return red, green, blue, transmittance - weight
+    # Compensated: in thin media a step takes less from the transmittance than its last bit holds.
+    change = lost - weight
+    behind = transmittance + change
+    return red, green, blue, behind, change - (behind - transmittance)
 
 
 def _skip_empty(b: Backend, tables: VolumeTables, rays: Rays, k: Any, point: Any) -> tuple[Any, Any]:

@@ -105,9 +105,9 @@ class VolumeRenderer:
         rays = enter_box(
             b, camera, (pixel - row * width, row), self._lower, self._cell_size, samples, self._steps_per_unit
         )
-        red, green, blue, transmittance = march(b, self._tables, rays)
+        red, green, blue, alpha = march(b, self._tables, rays)
         output = dr.zeros(b.Float, 4 * order.size * len(cameras))
-        dr.scatter(output, b.Float4(red, green, blue, 1.0 - transmittance), view * pixels + pixel)
+        dr.scatter(output, b.Float4(red, green, blue, alpha), view * pixels + pixel)
         return b.tensor(output, len(cameras), order.size, 4).cpu()
 
 
