@@ -1,10 +1,12 @@
 """Differentiable volume rendering of tetrahedral meshes.
 
 From a mesh with colour and density and a camera to an image, and from the derivative of a loss on that image back to
-colours, densities, vertex positions and camera poses; from images to an adaptive tetrahedral volume.
+colours, densities, vertex positions and camera poses; from images to a tetrahedral volume.
 """
 
+from difftetvr.capture import Capture, TransferFunction, Volume, VolumeCaptureConfig, load_capture
 from difftetvr.errors import BackendError, CameraError, CaptureError, DiffTetError, MeshError
+from difftetvr.fit import FitConfig, FitResult, fit
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.mesh.io import load, save
 from difftetvr.render import Camera, RenderedImage, render
@@ -13,13 +15,21 @@ __all__ = [
     "BackendError",
     "Camera",
     "CameraError",
+    "Capture",
     "CaptureError",
     "DiffTetError",
     "Field",
+    "FitConfig",
+    "FitResult",
     "MeshError",
     "RenderedImage",
     "TetMesh",
+    "TransferFunction",
+    "Volume",
+    "VolumeCaptureConfig",
+    "fit",
     "load",
+    "load_capture",
     "render",
     "save",
 ]
