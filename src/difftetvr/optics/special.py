@@ -10,6 +10,7 @@ approximate (thin cells). Where T decays a lot (thick cells) they are evaluated 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import cache
 from math import factorial, gamma
 from typing import Any
@@ -17,16 +18,35 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from difftetvr.optics import coefficients
+
 #: Optical depth up to which the polynomials of thin cells hold.
-THIN = 1.0
-#: Optical depth beyond which nothing of a cell is seen, at either precision: exp(-44) = 8e-20.
-_OPAQUE = 44.0
-_QUADRATURE_NODES = 32
+THIN = coefficients.THIN
 
 
-def is_double(value: Any) -> bool:
-    """Whether a Dr.Jit array holds float64 values; decides at trace time."""
-    return bool(dr.type_v(value) == dr.VarType.Float64)
+@dataclass(frozen=True)
+class _Tables:
+    """Constants at one precision.
+
+    Attributes:
+        h: ``exp(-tau/2)`` in tau.
+        sinh: ``sinh(tau/2) / tau`` in ``tau^2``.
+        p: ``(cosh(tau/2) - 2 sinh(tau/2) / tau) / tau^2`` in ``tau^2``.
+        u: ``U``, the integral of ``y sinh(tau y) / tau exp(v (1/4 - y^2))``; row k belongs to ``v^k``, in ``tau^2``.
+        n: ``N``, the integral of ``(1/4 - y^2) cosh(tau y) exp(v (1/4 - y^2))``, likewise.
+        nodes: Nodes in [0, 1] of the quadrature of thick cells.
+        weights: Its weights.
+        visible: Optical depth at which that quadrature stops.
+    """
+
+    h: Sequence[float]
+    sinh: Sequence[float]
+    p: Sequence[float]
+    u: Sequence[Sequence[float]]
+    n: Sequence[Sequence[float]]
+    nodes: Sequence[float]
+    weights: Sequence[float]
+    visible: float
 
 
 def polynomial(coefficients: Sequence[float], x: Any) -> Any:
@@ -51,12 +71,12 @@ def thin_weights(a: Any, b: Any) -> tuple[Any, Any, Any]:
     With ``sinh = sinh(tau/2)`` and ``Q = cosh(tau/2) - S``, S the integral of T divided by h, the weights are
     ``h (sinh + Q)`` and ``h (sinh - Q)``; integrating by parts, ``S = 2 sinh / tau + 2 v U``.
     """
-    tables = _thin_tables(is_double(a))
+    tables = _tables_for(a)
     tau, v = (a + b) * 0.5, (b - a) * 0.5
     square = tau * tau
-    h = polynomial(tables["h"], tau)
-    sinh = tau * polynomial(tables["sinh"], square)
-    q = dr.fma(square, polynomial(tables["p"], square), -2.0 * v * bivariate(tables["u"], square, v))
+    h = polynomial(tables.h, tau)
+    sinh = tau * polynomial(tables.sinh, square)
+    q = dr.fma(square, polynomial(tables.p, square), -2.0 * v * bivariate(tables.u, square, v))
     return h * (sinh + q), h * (sinh - q), dr.fma(-2.0 * h, sinh, 1.0)
 
 
@@ -65,18 +85,18 @@ def thin_derivatives(a: Any, b: Any) -> tuple[Any, Any, Any, Any, Any]:
 
     The derivatives of ``w1 = 1 - T1 - w0`` follow from ``dT1/da = dT1/db = -T1/2``.
     """
-    tables = _thin_tables(is_double(a))
+    tables = _tables_for(a)
     tau, v = (a + b) * 0.5, (b - a) * 0.5
     square = tau * tau
-    h = polynomial(tables["h"], tau)
-    sinh_over_tau = polynomial(tables["sinh"], square)
+    h = polynomial(tables.h, tau)
+    sinh_over_tau = polynomial(tables.sinh, square)
     sinh = tau * sinh_over_tau
-    u = bivariate(tables["u"], square, v)
+    u = bivariate(tables.u, square, v)
     vu = 2.0 * v * u
-    q = dr.fma(square, polynomial(tables["p"], square), -vu)
+    q = dr.fma(square, polynomial(tables.p, square), -vu)
     half_s = dr.fma(0.5, vu, sinh_over_tau)
     along_tau = dr.fma(-tau, u, half_s)
-    along_v = bivariate(tables["n"], square, v)
+    along_v = bivariate(tables.n, square, v)
     half_h = 0.5 * h
     return (
         h * (sinh + q),
@@ -100,37 +120,80 @@ def thick_derivatives(a: Any, b: Any) -> tuple[Any, Any, Any, Any, Any]:
 
 
 def _thick_moments(a: Any, b: Any) -> tuple[Any, Any, Any, Any]:
-    # Gauss-Legendre up to where the optical depth is _OPAQUE: tau(x) = a x + v x^2 solved for x without cancellation.
+    """Integrals of T, x T and x^2 T, and T1.
+
+    One quadrature rule on [0, reach], where ``tau(reach)`` is what is visible: solved for without cancellation, and for
+    both signs of v.
+    """
+    tables = _tables_for(a)
     tau, v = (a + b) * 0.5, (b - a) * 0.5
-    seen = dr.fmin(tau, _OPAQUE)
-    root = dr.sqrt(dr.fmax(dr.fma(a, a, 4.0 * v * seen), 0.0))
-    reach = dr.select(tau > _OPAQUE, 2.0 * seen / dr.fmax(a + root, 1e-30), 1.0)
+    hidden = tau > tables.visible
+    # The root is the density at ``reach`` times the length; a cell seen whole needs none (and b = 0 would spoil it).
+    root = dr.sqrt(dr.fmax(dr.fma(a, a, 4.0 * tables.visible * v), 0.0))
+    reach = dr.select(hidden, 2.0 * tables.visible / dr.select(hidden, a + root, 1.0), 1.0)
     slope, curve = -a * reach, -v * reach * reach
     m0 = m1 = m2 = type(a)(0.0)
-    nodes, node_weights = np.polynomial.legendre.leggauss(_QUADRATURE_NODES)
-    for node, weight in zip((nodes + 1.0) / 2.0, node_weights / 2.0, strict=True):
-        transmittance = dr.exp(dr.fma(curve, node * node, slope * node))
+    for node, weight in zip(tables.nodes, tables.weights, strict=True):
+        transmittance = dr.exp(dr.fma(curve, node, slope) * node)
         m0 = dr.fma(transmittance, weight, m0)
         m1 = dr.fma(transmittance, weight * node, m1)
         m2 = dr.fma(transmittance, weight * node * node, m2)
     square = reach * reach
-    return m0 * reach, m1 * square, m2 * square * reach, dr.exp(-tau)
+    return m0 * reach, m1 * square, m2 * (square * reach), dr.exp(-tau)
 
 
 def constant_density(tau: Any) -> tuple[Any, Any, Any, Any]:
     """``(w0, w1, T1, dw0/dtau)`` of a cell of constant density and linear colour, for every optical depth.
 
-    ``dw0/dtau`` is the first moment ``M = (1 - (1 + tau) exp(-tau)) / tau^2`` of T, and ``w1 = tau M``.
+    ``dw0/dtau`` is the first moment ``M = (1 - (1 + tau) exp(-tau)) / tau^2`` of T, and ``w1 = tau M``. The closed form
+    cancels for small depths; there the polynomials of thin cells serve, at v = 0.
     """
-    transmittance = dr.exp(-tau)
+    tables = _tables_for(tau)
+    h = dr.exp(-0.5 * tau)
+    square = tau * tau
+    sinh_over_tau = polynomial(tables.sinh, square)
+    moment = h * dr.fma(-tau, polynomial(tables.p, square), sinh_over_tau)
+    half_opacity = h * sinh_over_tau * tau
     thick = tau > THIN
-    safe = dr.select(thick, tau, 1.0)
-    closed = dr.fma(-transmittance, 1.0 + safe, 1.0) / (safe * safe)
-    moment = dr.select(thick, closed, polynomial(_constant_table(is_double(tau)), tau))
+    transmittance = dr.select(thick, h * h, dr.fma(-2.0, half_opacity, 1.0))
+    closed = dr.fma(-transmittance, 1.0 + tau, 1.0) / dr.select(thick, square, 1.0)
+    moment = dr.select(thick, closed, moment)
     w1 = tau * moment
-    w0 = tau * polynomial(_constant_table(is_double(tau)), -tau) * transmittance
-    w0 = dr.select(thick, 1.0 - transmittance - w1, w0)
+    w0 = dr.select(thick, 1.0 - transmittance, 2.0 * half_opacity) - w1
     return w0, w1, transmittance, moment
+
+
+def _tables_for(value: Any) -> _Tables:
+    # Decided at trace time, by the type of the Dr.Jit array.
+    return _double_tables() if dr.type_v(value) == dr.VarType.Float64 else _SINGLE
+
+
+_SINGLE = _Tables(
+    h=coefficients.H,
+    sinh=coefficients.SINH,
+    p=coefficients.P,
+    u=coefficients.U,
+    n=coefficients.N,
+    nodes=coefficients.NODES,
+    weights=coefficients.WEIGHTS,
+    visible=coefficients.VISIBLE,
+)
+
+
+@cache
+def _double_tables() -> _Tables:
+    """Taylor series to the last bit and a Gauss-Legendre rule: slower than the fitted constants, for checking."""
+    points, weights = np.polynomial.legendre.leggauss(32)
+    return _Tables(
+        h=[row[0] for row in _taylor(lambda j, k: (-0.5) ** k / factorial(k) if j == 0 else 0.0)],
+        sinh=_taylor(lambda j, k: 0.5 ** (2 * j + 1) / factorial(2 * j + 1) if k == 0 else 0.0)[0],
+        p=_taylor(lambda j, k: 0.25 ** (j + 1) * (2 * j + 2) / factorial(2 * j + 3) if k == 0 else 0.0)[0],
+        u=_taylor(lambda j, k: _beta_moment(j + 1, k) / factorial(k) / factorial(2 * j + 1)),
+        n=_taylor(lambda j, k: _beta_moment(j, k + 1) / factorial(k) / factorial(2 * j)),
+        nodes=((points + 1.0) / 2.0).tolist(),
+        weights=(weights / 2.0).tolist(),
+        visible=44.0,
+    )
 
 
 def _beta_moment(m: int, k: int) -> float:
@@ -138,35 +201,13 @@ def _beta_moment(m: int, k: int) -> float:
     return 0.5 ** (2 * m + 2 * k + 1) * gamma(m + 0.5) * gamma(k + 1) / gamma(m + k + 1.5)
 
 
-def _taylor(term: Callable[[int, int], float], tolerance: float) -> list[list[float]]:
-    """Coefficients ``term(j, k)`` of ``tau^(2j) v^k`` without those that stay below the tolerance for thin cells."""
+def _taylor(term: Callable[[int, int], float]) -> list[list[float]]:
+    """Coefficients ``term(j, k)`` of ``tau^(2j) v^k``, without those that do not count in thin cells."""
     rows = []
-    for k in range(24):
+    for k in range(40):
         row: list[float] = []
-        while abs(term(len(row), k)) * THIN ** (2 * len(row) + k) > tolerance:
+        while abs(term(len(row), k)) * THIN ** (2 * len(row) + k) > 1e-18:
             row.append(term(len(row), k))
         if row:
             rows.append(row)
     return rows
-
-
-@cache
-def _thin_tables(double: bool) -> dict[str, Any]:
-    tolerance = 1e-18 if double else 3e-9
-    return {
-        "sinh": _taylor(lambda j, k: 0.5 ** (2 * j + 1) / factorial(2 * j + 1) if k == 0 else 0.0, tolerance)[0],
-        "p": _taylor(lambda j, k: 0.25 ** (j + 1) * (2 * j + 2) / factorial(2 * j + 3) if k == 0 else 0.0, tolerance)[
-            0
-        ],
-        "u": _taylor(lambda j, k: _beta_moment(j + 1, k) / factorial(k) / factorial(2 * j + 1), tolerance),
-        "n": _taylor(lambda j, k: _beta_moment(j, k + 1) / factorial(k) / factorial(2 * j), tolerance),
-    } | {"h": [row[0] for row in _taylor(lambda j, k: (-0.5) ** k / factorial(k) if j == 0 else 0.0, tolerance)]}
-
-
-@cache
-def _constant_table(double: bool) -> list[float]:
-    # M(tau) = sum of (-tau)^k (k + 1) / (k + 2)!
-    tolerance = 1e-18 if double else 3e-9
-    return [
-        row[0] for row in _taylor(lambda j, k: (-1.0) ** k * (k + 1) / factorial(k + 2) if j == 0 else 0.0, tolerance)
-    ]
