@@ -19,8 +19,9 @@ def main(folder: Path) -> None:
     outer, inner = (torch.exp(-((radius - r) ** 2) / (2 * 0.06**2)) for r in (0.85, 0.45))
     opened = (x > 0) & (y < 0) & (z > -0.1)
     density = torch.where(opened, 0.0, 9.0 * outer) + 25.0 * inner
-    blue, orange = torch.tensor([0.3, 0.6, 1.0]), torch.tensor([1.0, 0.55, 0.2])
-    color = (outer[:, None] * blue + inner[:, None] * orange) / (outer + inner + 1e-6)[:, None]
+    normal_map = 0.5 + 0.5 * mesh.vertices / (radius[:, None] + 1e-6)
+    orange = torch.tensor([1.0, 0.55, 0.2])
+    color = (outer[:, None] * normal_map + inner[:, None] * orange) / (outer + inner + 1e-6)[:, None]
 
     camera = dtv.Camera.look_at(eye=(2.2, -2.6, 1.6), target=(0, 0, 0), up=(0, 0, 1), fov_y=0.7, width=400, height=300)
     field = dtv.Field(color, density)
