@@ -87,14 +87,17 @@ class Fit:
 
     def run(self, console: Console) -> None:
         """Fits, and fills the output folder."""
-        from difftetvr.fit.loop import fit
+        from difftetvr.fit.loop import fit, require_fittable
         from difftetvr.fit.progress import ProgressDisplay
         from difftetvr.view.report import write_report
 
         folder = RunFolder(self.output)
         self._require_same_run(folder)
-        folder.prepare(resume=self.resume, overwrite=self.overwrite)
+        folder.require_free(resume=self.resume, overwrite=self.overwrite)
         capture = self.views_of.load(self.capture, console)
+        require_fittable(capture, self.config)
+        # Only now: input that cannot be fitted neither leaves a folder behind nor costs the run that is to be replaced.
+        folder.create(overwrite=self.overwrite)
         write_json(folder.config, self.to_json())
         try:
             with ProgressDisplay(console) as display:
@@ -117,7 +120,7 @@ class Fit:
         saved = RunFolder(self.output).read_config() if self.resume else None
         if saved is None:
             return self
-        return _parse(Fit, args, dataclasses.replace(self, **_saved_options(saved)))
+        return _parse(Fit, args, dataclasses.replace(self, resume=False, overwrite=False, **_saved_options(saved)))
 
     def _require_same_run(self, folder: RunFolder) -> None:
         saved = folder.read_config() if self.resume else None

@@ -60,15 +60,15 @@ class RunFolder:
         """Whether a run has written into the folder."""
         return any(p.exists() for p in (self.config, self.checkpoint, self.model, self.metrics))
 
-    def prepare(self, *, resume: bool, overwrite: bool) -> None:
-        """Creates the folder, or makes sure that a run may go where one has been.
+    def require_free(self, *, resume: bool, overwrite: bool) -> None:
+        """Checks that a run may go into the folder; changes nothing.
 
         Args:
             resume: The run in the folder will be continued.
-            overwrite: The run in the folder is removed; other files are left alone.
+            overwrite: The run in the folder will be replaced.
 
         Raises:
-            FitError: The folder holds a run and neither is set, both are, or it cannot be created.
+            FitError: The folder holds a run and neither is set, both are, or it is a file.
         """
         if resume and overwrite:
             raise FitError("--resume and --overwrite contradict each other; give one of them.")
@@ -77,6 +77,18 @@ class RunFolder:
                 f"{self.path} already holds a run; continue it with --resume, replace it with --overwrite, or choose "
                 "another folder."
             )
+        if self.path.exists() and not self.path.is_dir():
+            raise FitError(f"{self.path} is a file, so no folder can have this name; choose another.")
+
+    def create(self, *, overwrite: bool) -> None:
+        """Creates the folder where there is none.
+
+        Args:
+            overwrite: Remove the files of a run in it; others are left alone.
+
+        Raises:
+            FitError: The folder cannot be created or emptied.
+        """
         try:
             self.path.mkdir(parents=True, exist_ok=True)
             if overwrite:

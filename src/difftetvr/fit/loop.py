@@ -43,16 +43,10 @@ class Trainer:
         """Prepares the first iteration on ``mesh``, by default the grid that the options ask for.
 
         Raises:
-            CaptureError: There are no training views, or the background needs alpha that the capture lacks.
+            CaptureError: The background needs alpha that the capture lacks.
             FitError: The device does not exist.
         """
-        if config.needs_alpha and capture.alphas is None:
-            raise CaptureError(
-                f"The images of '{capture.name}' have no alpha, which the background {config.background} needs; "
-                "use background black."
-            )
-        if not len(capture.train_indices):
-            raise CaptureError(f"'{capture.name}' has no training views; leave some out of the held-out set.")
+        require_fittable(capture, config)
         self.capture = capture
         self.config = config
         self.mesh = (mesh or build_grid(capture, config)).to(device=resolve_device(config.device))
@@ -185,16 +179,26 @@ def fit(
     return FitResult(trainer.mesh, field, evaluation, trainer.history, config)
 
 
-def build_grid(capture: Capture, config: FitConfig) -> TetMesh:
-    """The Kuhn grid over the capture's bounds that the options ask for.
+def require_fittable(capture: Capture, config: FitConfig) -> None:
+    """Checks what can be known before the first iteration.
 
     Raises:
-        CaptureError: The bounds are empty or not finite.
+        CaptureError: The images have no alpha but the background needs it.
+        FitError: The device does not exist.
+        BackendError: No back end works.
     """
+    if config.needs_alpha and capture.alphas is None:
+        raise CaptureError(
+            f"The images of '{capture.name}' have no alpha, which the background {config.background} needs; "
+            "use background black."
+        )
+    resolve_device(config.device)
+
+
+def build_grid(capture: Capture, config: FitConfig) -> TetMesh:
+    """The Kuhn grid over the capture's bounds that the options ask for."""
     lower, upper = capture.bounds.tolist()
     extent = [b - a for a, b in zip(lower, upper, strict=True)]
-    if not all(side > 0 and math.isfinite(side) for side in extent):
-        raise CaptureError(f"The bounds of '{capture.name}' are {lower} to {upper}; give a box with a volume.")
     return TetMesh.grid(config.grid or grid_cubes(config.cells, extent), lower, upper)
 
 

@@ -1,0 +1,10 @@
+"""A capture small enough to fit in seconds."""
+
+import pytest
+
+from difftetvr.capture import VolumeCaptureConfig
+
+
+@pytest.fixture(scope="session")
+def small_capture():
+    return VolumeCaptureConfig(views=10, width=24, height=24, steps_per_unit=300.0).build()

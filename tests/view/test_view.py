@@ -1,0 +1,101 @@
+"""Pictures, plots and tables."""
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from rich.console import Console
+
+from difftetvr.errors import CaptureError
+from difftetvr.fit.checkpoint import History
+from difftetvr.fit.evaluation import Evaluation
+from difftetvr.fit.progress import ProgressDisplay
+from difftetvr.fit.result import Progress
+from difftetvr.mesh import Field, TetMesh
+from difftetvr.view.describe import evaluation_table, mesh_tables
+from difftetvr.view.pictures import comparison, save_comparisons, save_png
+from difftetvr.view.plots import save_curves
+
+
+def text_of(*renderables):
+    console = Console(width=100, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
+    for renderable in renderables:
+        console.print(renderable)
+    return console.export_text()
+
+
+def test_png_holds_rounded_linear_values(tmp_path):
+    image = torch.tensor([[[0.0, 1.0, 0.5], [-1.0, 2.0, 0.25]]])
+    save_png(tmp_path / "a.png", image)
+    pixels = np.asarray(Image.open(tmp_path / "a.png"))
+    assert pixels.tolist() == [[[0, 255, 128], [0, 255, 64]]]
+    assert [p.name for p in tmp_path.iterdir()] == ["a.png"]
+
+
+@pytest.mark.parametrize("name", ["a.jpg", "a", "missing/a.png"])
+def test_pictures_that_cannot_be_written(tmp_path, name):
+    with pytest.raises(CaptureError, match=r"PNG|Cannot write"):
+        save_png(tmp_path / name, torch.zeros(4, 4, 3))
+    assert not list(tmp_path.iterdir())
+
+
+def test_comparison_shows_truth_reconstruction_and_difference():
+    truth = torch.zeros(64, 64, 3)
+    reconstruction = torch.full((64, 64, 3), 0.1)
+    pixels = np.asarray(comparison(truth, reconstruction))
+    middle = pixels[pixels.shape[0] - 100]
+    third = pixels.shape[1] // 3
+    assert middle[third // 2].tolist() == [0, 0, 0]
+    assert middle[third + third // 2].tolist() == [26, 26, 26]
+    assert middle[2 * third + third // 2].tolist() == [102, 102, 102]
+    assert (pixels[:20] < 128).any(), "the label"
+
+
+def test_comparisons_are_stacked(tmp_path):
+    image = torch.rand(300, 200, 3)
+    save_comparisons(tmp_path / "one.png", [("truth", image, image)])
+    save_comparisons(tmp_path / "three.png", [("truth", image, image)] * 3)
+    one, three = (Image.open(tmp_path / name).size for name in ("one.png", "three.png"))
+    assert one[0] == three[0]
+    assert three[1] >= 3 * one[1]
+
+
+@pytest.mark.parametrize("count", [0, 1, 500])
+def test_curves(tmp_path, count):
+    evaluations = [(100, 12.0), (200, 15.0)] if count > 200 else []
+    history = History([1.0 / (i + 1) for i in range(count)], [10.0 + i for i in range(count)], evaluations)
+    save_curves(tmp_path / "curves.png", history)
+    assert Image.open(tmp_path / "curves.png").size[0] > 500
+
+
+def test_mesh_tables_say_what_the_mesh_holds():
+    mesh = TetMesh.grid((2, 3, 4))
+    text = text_of(*mesh_tables("a.vtu", mesh, Field(torch.rand(144, 3), torch.full((144,), 7.0), location="cell")))
+    for expected in ("a.vtu", "144", "60", "(0, 0, 0) to (1, 1, 1)", "per cell, 7 to 7", "quality Q"):
+        assert expected in text
+    assert "none (geometry only)" in text_of(*mesh_tables("a.vtu", mesh, None))
+
+
+def test_evaluation_table_has_means():
+    text = text_of(evaluation_table(Evaluation([3, 8], [20.0, 30.0], [0.5, 0.7])))
+    for expected in ("3", "8", "20.00", "30.00", "mean", "25.00", "0.6000"):
+        assert expected in text
+    assert "-" in text_of(evaluation_table(Evaluation([3], [20.0], [])))
+
+
+def test_progress_prints_plain_lines_where_there_is_no_terminal():
+    console = Console(width=60, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
+    with ProgressDisplay(console) as display:
+        for i in (1, 2, 3):
+            display(Progress(i, 3, 0.01, 20.0, 19.5 if i > 1 else None, 12345, float(i)))
+    lines = console.export_text().splitlines()
+    assert len(lines) == 2
+    for expected in ("3/3", "1.00e-02", "20.00 dB (held out 19.50)", "12,345 cells", "it/s", "0:00 left"):
+        assert expected in lines[-1]
+
+
+def test_progress_draws_a_bar_on_a_terminal():
+    console = Console(width=160, record=True, force_terminal=True, file=open("/dev/null", "w"))  # noqa: SIM115
+    with ProgressDisplay(console) as display:
+        display(Progress(50, 100, 0.01, 20.0, None, 12345, 1.0))
+    assert "50/100" in console.export_text()
