@@ -10,6 +10,7 @@ import torch
 from difftetvr.errors import MeshError
 from difftetvr.mesh import generators, quality, validation
 from difftetvr.mesh.arrays import true_indices
+from difftetvr.mesh.delaunay import delaunay as triangulate
 from difftetvr.mesh.topology import Topology
 
 
@@ -97,6 +98,25 @@ class TetMesh:
             MeshError: A size is no positive integer, the box is empty or not finite, or the grid too large or too fine.
         """
         vertices, tets = generators.grid(shape, lower, upper, dtype, device)
+        return cls.from_valid(vertices, Topology(tets, vertices.shape[0]))
+
+    @classmethod
+    def delaunay(cls, points: Any) -> TetMesh:
+        """The Delaunay mesh of the convex hull of points.
+
+        Flat cells are dropped from the hull only, never from the interior; ties between cospherical points are broken
+        such that neither flat cells nor mismatched faces remain (see `difftetvr.mesh.delaunay`).
+
+        Args:
+            points: (V, 3) positions, array-like; kept as the vertices, in order and with their autograd graph.
+
+        Returns:
+            The mesh. Duplicate points become unused vertices.
+
+        Raises:
+            MeshError: Fewer than four points, points not finite or in one plane, or no valid mesh was found.
+        """
+        vertices, tets = triangulate(points)
         return cls.from_valid(vertices, Topology(tets, vertices.shape[0]))
 
     @property
