@@ -194,7 +194,8 @@ class TetMesh:
         if kept.numel() == self.num_vertices:
             return self, kept
         renumbered = used.cumsum(0, dtype=torch.int32) - 1
-        return TetMesh.from_valid(self.vertices[kept], Topology(renumbered[self.tets], kept.numel())), kept
+        topology = Topology(renumbered[self.tets], kept.numel(), self.topology.cell_adjacency)
+        return TetMesh.from_valid(self.vertices[kept], topology), kept
 
     def volumes(self) -> torch.Tensor:
         """(T,) volumes of the cells in cubed units of length; differentiable."""

@@ -32,16 +32,17 @@ class Topology:
         num_vertices: Number of vertices V.
     """
 
-    def __init__(self, tets: torch.Tensor, num_vertices: int) -> None:
+    def __init__(self, tets: torch.Tensor, num_vertices: int, cell_adjacency: torch.Tensor | None = None) -> None:
         """Wrap the cells; nothing is computed yet.
 
         Args:
             tets: (T, 4) int32 vertex indices, all in [0, num_vertices).
             num_vertices: Number of vertices V, unused ones included.
+            cell_adjacency: (T, 4) int32, where the caller knows it already.
         """
-        self.tets = tets
+        self.tets = tets.contiguous()
         self.num_vertices = num_vertices
-        self._tables: dict[str, Any] = {}
+        self._tables: dict[str, Any] = {} if cell_adjacency is None else {"cell_adjacency": cell_adjacency}
 
     @property
     def num_cells(self) -> int:
@@ -116,11 +117,8 @@ class Topology:
         tets = self.tets.to(device)
         if tets is self.tets:
             return self
-        moved = Topology(tets, self.num_vertices)
         adjacency = self._tables.get("cell_adjacency")
-        if adjacency is not None:
-            moved._tables["cell_adjacency"] = adjacency.to(device)
-        return moved
+        return Topology(tets, self.num_vertices, None if adjacency is None else adjacency.to(device))
 
     def _build_cell_adjacency(self) -> torch.Tensor:
         matching = match_faces(self.tets, self.num_vertices)
@@ -137,7 +135,7 @@ class Topology:
 
     def _build_face_table(self) -> tuple[torch.Tensor, torch.Tensor]:
         faces, face_cells = [], []
-        for part in chunks(self.num_cells, self.tets.device, width=4):
+        for part in chunks(self.num_cells, self.tets.device, width=12):
             neighbours = self.cell_adjacency[part]
             cells = torch.arange(part.start, part.stop, dtype=torch.int32, device=neighbours.device)[:, None]
             # Of the two half-faces of an inner face, the one of the smaller cell stands for it.
@@ -155,8 +153,9 @@ class Topology:
     def _build_edges(self) -> torch.Tensor:
         parts = []
         for part in chunks(self.num_cells, self.tets.device, width=6):
-            ordered = self.tets[part].sort(1).values.long()
-            keys = torch.cat([(ordered[:, i] << _ROW_BITS) | ordered[:, j] for i, j in LOCAL_EDGES])
+            corners = self.tets[part].long().unbind(1)
+            ends = [(corners[i], corners[j]) for i, j in LOCAL_EDGES]
+            keys = torch.cat([(torch.minimum(p, q) << _ROW_BITS) | torch.maximum(p, q) for p, q in ends])
             parts.append(torch.unique_consecutive(sort_keys(keys)))
         keys = torch.unique_consecutive(sort_keys(torch.cat(parts)))
         return torch.stack(((keys >> _ROW_BITS).int(), (keys & _ROW_MASK).int()), 1)

@@ -111,7 +111,8 @@ def orientations(vertices: torch.Tensor, tets: torch.Tensor) -> torch.Tensor:
     # A power of two as the unit of length changes no digit, and keeps cubes of extreme float64 coordinates in range.
     positions = vertices.detach().double()
     _, exponent = torch.frexp(positions.abs().max())
-    axes = torch.ldexp(positions, -exponent).t().contiguous()
+    unit = torch.exp2(-exponent.double().clamp(-1000, 1000))
+    axes = (positions * unit).t().contiguous()
     signs = torch.empty(tets.shape[0], dtype=torch.int8, device=tets.device)
     uncertain = []
     for part in chunks(tets.shape[0], tets.device):
