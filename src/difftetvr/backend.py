@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import importlib
 import platform
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -85,6 +87,22 @@ class Backend:
         dr.sync_thread()
         tensor = array.torch()
         return tensor.reshape(shape) if shape else tensor
+
+    @contextmanager
+    def one_thread(self, active: bool) -> Iterator[None]:
+        """Run kernels on one CPU thread while active, so that sums over rays are taken in a fixed order.
+
+        Has no effect on GPUs, whose atomic additions have no order.
+        """
+        threads = dr.thread_count() if active and self.name == "llvm" else 0
+        if threads:
+            dr.set_thread_count(1)
+        try:
+            yield
+        finally:
+            if threads:
+                dr.sync_thread()
+                dr.set_thread_count(threads)
 
     def _await_torch(self) -> None:
         # Torch and Dr.Jit run on streams of their own.

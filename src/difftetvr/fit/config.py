@@ -57,6 +57,9 @@ class FitConfig:
     """Density that all vertices start with, in units of the capture's density."""
     seed: int = 0
     """Seed of the order of the views and of random backgrounds."""
+    deterministic: bool = True
+    """Repeatable to the last bit on one machine, also across --resume; on CPUs the backward pass then runs on one
+    thread. False is faster on many cores."""
     device: str | None = None
     """Where to run, such as cpu, cuda or mps; default: the best that works."""
     evaluate_every: int = 100

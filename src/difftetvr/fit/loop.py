@@ -131,7 +131,13 @@ class Trainer:
         device = self.mesh.vertices.device
         truth = true_image(self.capture, view, background).to(device)
         behind = torch.tensor(background, device=device)
-        image = render(self.mesh, self.parameters.field(), self.capture.cameras[view], background=behind).color
+        image = render(
+            self.mesh,
+            self.parameters.field(),
+            self.capture.cameras[view],
+            background=behind,
+            deterministic=self.config.deterministic,
+        ).color
         loss = LOSSES[self.config.loss](image, truth)
         (weight * loss).backward()
         return float(loss.detach()), float((image.detach() - truth).square().mean())

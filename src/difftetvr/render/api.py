@@ -40,6 +40,7 @@ def render(
     renderer: str = "marching",
     optics: OpticalModel | None = None,
     transmittance_threshold: float = 0.0,
+    deterministic: bool = False,
 ) -> RenderedImage:
     """Render a tetrahedral mesh by emission and absorption (article section 3, solved exactly).
 
@@ -55,6 +56,8 @@ def render(
         optics: Optical model of one cell; exact integration of the linear field if None.
         transmittance_threshold: Rays stop once their transmittance is at or below this value, in [0, 1); 0 stops none
             before it vanishes.
+        deterministic: Whether gradients are the same in every run to the last bit: the backward pass then runs on one
+            thread. CPU only. Images always are.
 
     Returns:
         The image, on the device of ``mesh.vertices``.
@@ -78,7 +81,7 @@ def render(
     backend = backend_for(mesh.vertices)
     if optics is None:
         optics = ConstantPerCell() if per_cell else ExactLinear()
-    task = MarchingTask(backend, mesh, camera, optics, per_cell, transmittance_threshold)
+    task = MarchingTask(backend, mesh, camera, optics, per_cell, transmittance_threshold, deterministic)
     vertices = camera.to_camera_space(mesh.vertices)
     color, density = field.color.to(backend.dtype), field.density.to(backend.dtype)
     light, distance = MarchingFunction.apply(task, vertices, color, density)

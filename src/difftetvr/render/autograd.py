@@ -28,6 +28,7 @@ class MarchingTask:
     optics: OpticalModel
     per_cell: bool
     threshold: float
+    deterministic: bool
 
     def scene(self, vertices: torch.Tensor, color: torch.Tensor, density: torch.Tensor) -> MarchingScene:
         """Upload a view: (V, 3) vertices in camera space, (N, 3) colours and (N,) densities of vertices or cells."""
@@ -79,7 +80,8 @@ class MarchingFunction(torch.autograd.Function):
             backend.floats(light),
             backend.floats(distance),
         )
-        gradients = render_adjoint(ctx.scene, image, ctx.vertex_count, needs_vertices)
+        with backend.one_thread(ctx.task.deterministic):
+            gradients = render_adjoint(ctx.scene, image, ctx.vertex_count, needs_vertices)
         field = backend.tensor(gradients.field).reshape(-1, 4)
         vertices = backend.tensor(gradients.vertices).reshape(-1, 4)[:, :3] if needs_vertices else None
         return None, vertices, field[:, :3] if needs_color else None, field[:, 3] if needs_density else None
