@@ -54,7 +54,9 @@ def leaves_of(scene: Scene, dtype: torch.dtype, requires_grad: Iterable[str] = (
     }
 
 
-def render_leaves(scene: Scene, leaves: dict[str, Tensor], mesh: TetMesh | None = None, **options: Any) -> RenderedImage:
+def render_leaves(
+    scene: Scene, leaves: dict[str, Tensor], mesh: TetMesh | None = None, **options: Any
+) -> RenderedImage:
     """Render leaves made by :func:`leaves_of`, on ``mesh``'s topology if it is given."""
     mesh = TetMesh(leaves["vertices"], scene.tets) if mesh is None else mesh.with_vertices(leaves["vertices"])
     field = Field(leaves["color"], leaves["density"], "cell" if scene.per_cell else "vertex")

@@ -126,6 +126,15 @@ def test_axis_aligned_camera_exactly_on_a_part_of_the_mesh(place: str, center: t
         assert float(errors.amin(0).max()) < tolerance
 
 
+@pytest.mark.parametrize("offset", [1e-7, 1e-6, 2e-6])
+def test_rays_that_graze_a_face_beside_the_camera(offset: float) -> None:
+    """A column of rays runs along a grid plane for a while before it crosses it: what lies before counts, too."""
+    camera = axis_camera((offset, 0.03, 0.1), 8.0, (17, 13), (8.501, 6.3))
+    scene = make_scene(kuhn_grid((4, 4, 4)), camera, 42, density=10.0)
+    assert_image(render_scene(scene), scene, FLOAT32_TOLERANCE)
+    assert_image(render_scene(scene, torch.float64), scene, 1e-8)
+
+
 def test_camera_in_every_cell_of_a_mesh() -> None:
     """One view from near the centre of each of many cells, each a different start of the walk."""
     mesh = jittered_grid((3, 3, 3), 0.15, 43)

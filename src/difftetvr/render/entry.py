@@ -18,11 +18,10 @@ from difftetvr.mesh import TetMesh
 from difftetvr.mesh.topology import LOCAL_FACES
 from difftetvr.render.camera import Camera
 from difftetvr.render.rays import Pinhole, pixel_frame
-from difftetvr.render.walk import Corner, find_exit, holds_ray, interpolate, make_face
+from difftetvr.render.walk import Corner, crossing_depth, find_exit, holds_ray, make_face
 
-_INSIDE_TOLERANCE = (
-    1e-5  # of a barycentric coordinate: a camera on a face, edge or vertex counts as inside every cell there
-)
+# Cells this near to the camera, relative to their size, are tried as the cell that holds it; each ray then decides.
+_NEAR = 1e-4
 
 
 @dataclass
@@ -139,7 +138,7 @@ def find_entries(backend: Backend, mesh: TetMesh, camera_vertices: torch.Tensor,
 
 
 def _cells_around_camera(backend: Backend, mesh: TetMesh, camera_vertices: torch.Tensor) -> torch.Tensor | None:
-    """Cells that hold the camera, or None: all that touch it when it lies on a face, an edge or a vertex."""
+    """Cells that may hold the camera: it lies in them or very near; None if there are none."""
     positions = camera_vertices.detach()
     lower, upper = positions.amin(dim=0), positions.amax(dim=0)
     if not bool(((lower <= 0) & (upper >= 0)).all()):
@@ -151,13 +150,20 @@ def _cells_around_camera(backend: Backend, mesh: TetMesh, camera_vertices: torch
         index = dr.gather(backend.UInt, tets, 4 * cell + k)
         points.append([dr.gather(backend.Float, vertices, 3 * index + axis) for axis in range(3)])
 
-    # The camera is the origin: a face seen from outside its cell spans a negative volume with a camera inside.
-    volumes = [-_triple(points[i], points[j], points[k]) for i, j, k in LOCAL_FACES]
-    total = volumes[0] + volumes[1] + volumes[2] + volumes[3]
-    inside = total > 0
-    for volume in volumes:
-        inside &= volume >= -_INSIDE_TOLERANCE * total
-    found = dr.compress(inside)
+    extent, around = backend.Float(0), backend.Bool(True)
+    lows, highs = [], []
+    for axis in range(3):
+        values = [point[axis] for point in points]
+        lows.append(dr.fmin(dr.fmin(values[0], values[1]), dr.fmin(values[2], values[3])))
+        highs.append(dr.fmax(dr.fmax(values[0], values[1]), dr.fmax(values[2], values[3])))
+        extent = dr.fmax(extent, highs[axis] - lows[axis])
+    margin = _NEAR * extent
+    for low, high in zip(lows, highs, strict=True):
+        around &= (low <= margin) & (high >= -margin)
+    # The camera is the origin: with an outward face of a cell around it, it spans a positive volume.
+    for i, j, k in LOCAL_FACES:
+        around &= _triple(points[i], points[j], points[k]) >= -_NEAR * extent * extent * extent
+    found = dr.compress(around)
     return None if dr.width(found) == 0 else backend.tensor(backend.Int(found))
 
 
@@ -172,22 +178,22 @@ def _start_rows(scene: _Scene, begin: int, end: int) -> Any:
     pixel = dr.arange(uint, scene.camera.width * scene.camera.height)
     row_index = pixel // scene.pinhole.width
     frame = pixel_frame(scene.pinhole, pixel - row_index * scene.pinhole.width, row_index)
-    none, last = backend.opaque_uint(end), backend.opaque_uint(end)
+    none = backend.opaque_uint(end)
 
     def body(row: Any, best: Any, farthest: Any) -> tuple[Any, Any, Any]:
         face = scene.face(frame, row)
         apex = scene.corner(frame, dr.gather(uint, scene.apices, row), True)
-        exit_face = find_exit(face, apex).face(face, apex)
-        exit_t = interpolate(exit_face, exit_face.weights())[0]
-        better = holds_ray(face) & (exit_t > farthest)
-        return row + 1, dr.select(better, row, best), dr.select(better, exit_t, farthest)
+        exit_depth = crossing_depth(find_exit(face, apex).face(face, apex))
+        spans = holds_ray(face) & (crossing_depth(face) <= 0) & (exit_depth > farthest)
+        return row + 1, dr.select(spans, row, best), dr.select(spans, exit_depth, farthest)
 
+    lanes = dr.width(pixel)
     state = (
-        uint(backend.opaque_uint(begin)) + dr.zeros(uint, dr.width(pixel)),
-        none + dr.zeros(uint, dr.width(pixel)),
-        dr.zeros(real, dr.width(pixel)),
+        backend.opaque_uint(begin) + dr.zeros(uint, lanes),
+        none + dr.zeros(uint, lanes),
+        dr.zeros(real, lanes),
     )
-    _, best, _ = dr.while_loop(state, lambda row, best, farthest: row < last, body)
+    _, best, _ = dr.while_loop(state, lambda row, best, farthest: row < none, body)
     dr.eval(best)
     return best
 
@@ -278,7 +284,7 @@ def _for_each_hit(scene: _Scene, items: _WorkItems | None, visit: Any) -> None:
             a, b, t = frame.project(*point)
             corners.append(Corner(vertex, a, b, [t], []))
         face = make_face(corners)
-        depth = interpolate(face, face.weights())[0]
+        depth = crossing_depth(face)
         visit(items.row * scene.pinhole.width + column, items.face, depth, holds_ray(face) & (depth > 0))
         return (column + 1,)
 

@@ -48,7 +48,7 @@ class Face:
     def weights(self) -> list[Any]:
         """Barycentric weights of the ray's crossing; the edges share one sign, so nothing cancels."""
         total = self.edges[0] + self.edges[1] + self.edges[2]
-        inverse = dr.select(total > 0, 1.0 / total, 0.0)
+        inverse = dr.select(total != 0, 1.0 / total, 0.0)
         return [edge * inverse for edge in self.edges]
 
 
@@ -77,6 +77,22 @@ def holds_ray(face: Face) -> Any:
         left = is_left(edge, p.a, p.b, q.a, q.b)
         inside = left if inside is None else inside & left
     return inside
+
+
+def crossing_depth(face: Face) -> Any:
+    """Distance t of the ray's crossing, the same to the last bit from both sides of the face and in every kernel.
+
+    Corners are taken in the order of their vertices. The sign of this value decides whether a face lies in front of
+    the camera, so a path of cells either enters there, or has a cell that spans the camera, never both or neither.
+    """
+    corners = [(c.vertex, c.a, c.b, c.values[0]) for c in face.corners]
+    for i, j in ((0, 1), (1, 2), (0, 1)):
+        swap = corners[i][0] > corners[j][0]
+        first = tuple(dr.select(swap, y, x) for x, y in zip(corners[i], corners[j], strict=True))
+        second = tuple(dr.select(swap, x, y) for x, y in zip(corners[i], corners[j], strict=True))
+        corners[i], corners[j] = first, second
+    ordered = make_face([Corner(vertex, a, b, [t], []) for vertex, a, b, t in corners])
+    return interpolate(ordered, ordered.weights())[0]
 
 
 @dataclass
