@@ -18,7 +18,7 @@ from difftetvr.mesh import TetMesh
 from difftetvr.mesh.topology import LOCAL_FACES
 from difftetvr.render.camera import Camera
 from difftetvr.render.rays import Pinhole, pixel_frame
-from difftetvr.render.walk import Corner, crossing_depth, find_exit, holds_ray, make_face
+from difftetvr.render.walk import BOUNDARY, Corner, crossing_depth, find_exit, holds_ray, make_face
 
 # Cells this near to the camera, relative to their size, are tried as the cell that holds it; each ray then decides.
 _NEAR = 1e-4
@@ -124,7 +124,7 @@ def find_entries(backend: Backend, mesh: TetMesh, camera_vertices: torch.Tensor,
         backend.floats(camera_vertices),
         *(backend.uints(part) for part in (table.corners, table.cells, table.apices)),
     )
-    start = None if around is None else _start_rows(scene, boundary_rows, table.cells.shape[0])
+    start = None if around is None else _start_rows(scene, mesh, around, boundary_rows)
     count, first, items = _rasterise(scene, boundary_rows, start)
     deepest = int(dr.max(count)[0])
     lists = EntryLists(scene.corners, scene.cells, scene.apices, None, count, first, around is not None, deepest <= 1)
@@ -172,28 +172,48 @@ def _triple(p: list[Any], q: list[Any], r: list[Any]) -> Any:
     return p[0] * (q[1] * r[2] - q[2] * r[1]) + p[1] * (q[2] * r[0] - q[0] * r[2]) + p[2] * (q[0] * r[1] - q[1] * r[0])
 
 
-def _start_rows(scene: _Scene, begin: int, end: int) -> Any:
-    """Per pixel, the row of the cell in which a ray from the camera inside the mesh starts; ``end`` where none does."""
+def _start_rows(scene: _Scene, mesh: TetMesh, around: torch.Tensor, begin: int) -> Any:
+    """Per pixel, the row of the cell in which a ray starts inside the mesh; the number of rows where none does.
+
+    Args:
+        scene: The table's last rows are the faces of the cells around the camera.
+        mesh: Mesh, for its adjacency.
+        around: Cells around the camera.
+        begin: First of those rows.
+    """
     backend, uint, real = scene.backend, scene.backend.UInt, scene.backend.Float
     pixel = dr.arange(uint, scene.camera.width * scene.camera.height)
     row_index = pixel // scene.pinhole.width
     frame = pixel_frame(scene.pinhole, pixel - row_index * scene.pinhole.width, row_index)
-    none = backend.opaque_uint(end)
+    none = backend.opaque_uint(dr.width(scene.cells))
+    neighbors = backend.uints(mesh.topology.cell_adjacency[around.long()].T)
 
-    def body(row: Any, best: Any, farthest: Any) -> tuple[Any, Any, Any]:
+    def body(row: Any, best: Any, farthest: Any, ahead: Any) -> tuple[Any, Any, Any, Any]:
         face = scene.face(frame, row)
         apex = scene.corner(frame, dr.gather(uint, scene.apices, row), True)
-        exit_depth = crossing_depth(find_exit(face, apex).face(face, apex))
-        spans = holds_ray(face) & (crossing_depth(face) <= 0) & (exit_depth > farthest)
-        return row + 1, dr.select(spans, row, best), dr.select(spans, exit_depth, farthest)
+        depth, exit_depth = crossing_depth(face), crossing_depth(find_exit(face, apex).face(face, apex))
+        holds = holds_ray(face)
+        spans = holds & (depth <= 0) & (exit_depth > farthest)
+        enters = holds & (depth > 0) & (dr.gather(uint, neighbors, row - begin_row) == BOUNDARY)
+        return (
+            row + 1,
+            dr.select(spans, row, best),
+            dr.select(spans, exit_depth, farthest),
+            dr.select(enters, dr.fmin(ahead, depth), ahead),
+        )
 
     lanes = dr.width(pixel)
+    begin_row = backend.opaque_uint(begin)
     state = (
-        backend.opaque_uint(begin) + dr.zeros(uint, lanes),
+        begin_row + dr.zeros(uint, lanes),
         none + dr.zeros(uint, lanes),
         dr.zeros(real, lanes),
+        dr.full(real, dr.inf, lanes),
     )
-    _, best, _ = dr.while_loop(state, lambda row, best, farthest: row < none, body)
+    _, best, farthest, ahead = dr.while_loop(state, lambda row, *_: row < none, body)
+    # Depths within rounding of the camera need not grow along a ray. Where it enters through a boundary face ahead and
+    # before the end of the cell found here, both belong to one path, and it starts at that face.
+    best = dr.select(ahead < farthest, none, best)
     dr.eval(best)
     return best
 
