@@ -108,7 +108,9 @@ GRID_POINTS = {
 def test_camera_on_a_part_of_the_mesh(place: str, per_cell: bool) -> None:
     """Orientation at random; the position is exact but for the rounding of the float32 extrinsics."""
     scene = make_scene(kuhn_grid((4, 4, 4)), camera_at(GRID_POINTS[place], 41, (24, 20), 2.2), 41, per_cell=per_cell)
-    assert_image(render_scene(scene), scene, FLOAT32_TOLERANCE)
+    # From a surface, rounding by 3e-8 moves the entry of a ray that grazes the surface a thousand times as far.
+    grazing = 10.0 if "boundary" in place else 1.0
+    assert_image(render_scene(scene), scene, grazing * FLOAT32_TOLERANCE)
     assert_image(render_scene(scene, torch.float64), scene, 1e-8)
 
 
