@@ -63,7 +63,7 @@ class Backend:
     def floats(self, tensor: torch.Tensor) -> Any:
         """Flat Dr.Jit view of a floating-point tensor, without a copy if it is contiguous and of this precision.
 
-        Whoever launches a kernel on the view waits for it, with :meth:`tensor`, before the view may go away.
+        Compute what depends on the view with :meth:`run` before the tensor may go away.
         """
         self._await_torch()
         return self.Float(tensor.detach().to(self.dtype).contiguous().reshape(-1))
@@ -81,10 +81,18 @@ class Backend:
         """An integer as a device value, so that kernels need no recompilation when it changes."""
         return dr.opaque(self.UInt, int(value))
 
-    def tensor(self, array: Any, *shape: int) -> torch.Tensor:
-        """PyTorch tensor over a Dr.Jit array's memory, without a copy; waits for all kernels launched so far."""
-        dr.eval(array)
+    def run(self, *arrays: Any) -> None:
+        """Compute arrays and wait for them.
+
+        Dr.Jit lets go of a view when its kernel is launched, not when it is done; without waiting, PyTorch could reuse
+        the memory of a temporary tensor that a kernel still reads.
+        """
+        dr.eval(*arrays)
         dr.sync_thread()
+
+    def tensor(self, array: Any, *shape: int) -> torch.Tensor:
+        """PyTorch tensor over a Dr.Jit array's memory, without a copy; computes it first, see :meth:`run`."""
+        self.run(array)
         tensor = array.torch()
         return tensor.reshape(shape) if shape else tensor
 

@@ -108,7 +108,7 @@ def render_adjoint(scene: MarchingScene, image: ImageAdjoint, vertex_count: int,
     )
     kernel = _AdjointKernel(scene, gradients, make_rays(scene), image)
     walk(scene, kernel.rays, kernel.read, kernel.visit, kernel.leave, kernel.start())
-    dr.eval(gradients.field, gradients.vertices) if with_vertices else dr.eval(gradients.field)
+    scene.backend.run(gradients.field, gradients.vertices)
     return gradients
 
 

@@ -214,7 +214,7 @@ def _start_rows(scene: _Scene, mesh: TetMesh, around: torch.Tensor, begin: int) 
     # Depths within rounding of the camera need not grow along a ray. Where it enters through a boundary face ahead and
     # before the end of the cell found here, both belong to one path, and it starts at that face.
     best = dr.select(ahead < farthest, none, best)
-    dr.eval(best)
+    backend.run(best)
     return best
 
 
@@ -226,7 +226,7 @@ def _rasterise(scene: _Scene, rows: int, start: Any | None) -> tuple[Any, Any, A
     if start is not None:
         has_start = start < scene.backend.opaque_uint(dr.width(scene.cells))
         count, first = dr.select(has_start, uint(1), uint(0)), uint(start)
-        dr.eval(count, first)
+        scene.backend.run(count, first)
     items = _work_items(scene, rows)
 
     def visit(pixel: Any, row: Any, depth: Any, hit: Any) -> None:
@@ -234,7 +234,7 @@ def _rasterise(scene: _Scene, rows: int, start: Any | None) -> tuple[Any, Any, A
         dr.scatter(first, row, pixel, hit)
 
     _for_each_hit(scene, items, visit)
-    dr.eval(count, first)
+    scene.backend.run(count, first)
     return count, first, items
 
 
@@ -285,7 +285,7 @@ def _work_items(scene: _Scene, rows: int) -> _WorkItems | None:
     offset = dr.arange(uint, total) - dr.gather(uint, backend.uints(begins), owner)
     row = uint(dr.gather(backend.Int, row0, owner)) + offset
     first_column, last_column = (uint(dr.gather(backend.Int, c, owner)) for c in (column0, column1))
-    dr.eval(owner, row, first_column, last_column)
+    backend.run(owner, row, first_column, last_column)
     return _WorkItems(owner, row, first_column, last_column, total)
 
 
@@ -322,7 +322,7 @@ def _fill_lists(scene: _Scene, items: _WorkItems | None, lists: EntryLists, star
         dr.scatter(rows, start, lists.offset, has_start)
         dr.scatter(depths, real(-1), lists.offset, has_start)
         used = dr.select(has_start, uint(1), uint(0))
-    dr.eval(rows, depths, used)
+    scene.backend.run(rows, depths, used)
 
     def visit(pixel: Any, row: Any, depth: Any, hit: Any) -> None:
         slot = dr.gather(uint, lists.offset, pixel, hit) + dr.scatter_inc(used, pixel, hit)
@@ -330,7 +330,7 @@ def _fill_lists(scene: _Scene, items: _WorkItems | None, lists: EntryLists, star
         dr.scatter(depths, depth, slot, hit)
 
     _for_each_hit(scene, items, visit)
-    dr.eval(rows, depths)
+    scene.backend.run(rows, depths)
     return _sort_lists(scene, lists, rows, depths)
 
 
@@ -353,5 +353,5 @@ def _sort_lists(scene: _Scene, lists: EntryLists, rows: Any, depths: Any) -> Any
         return (position + 1,)
 
     dr.while_loop((uint(lists.offset),), lambda position: position < end, place)
-    dr.eval(ordered)
+    scene.backend.run(ordered)
     return ordered

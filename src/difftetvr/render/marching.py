@@ -218,5 +218,5 @@ def render_forward(scene: MarchingScene) -> tuple[Any, Any]:
     light, distance = dr.empty(real, 4 * pixels), dr.empty(real, pixels)
     dr.scatter(light, backend.Float4(*ray.color, ray.transmittance), rays.pixel, rays.valid)
     dr.scatter(distance, ray.distance, rays.pixel, rays.valid)
-    dr.eval(light, distance)
+    backend.run(light, distance)
     return light, distance
