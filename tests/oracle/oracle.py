@@ -204,11 +204,12 @@ def _integrate(
     moment = (weight * (t_in[:, None] + length[:, None] * x)).sum(1)
 
     radiance = torch.zeros(pixels, 3, dtype=torch.float64).index_add(0, ray, emitted)
-    alpha = -torch.expm1(-table.sum(dim=1))
+    optical_depth = table.sum(dim=1)
+    alpha = -torch.expm1(-optical_depth)
     visible = alpha > 0
     total_moment = torch.zeros(pixels, dtype=torch.float64).index_add(0, ray, moment)
     expected = torch.where(visible, total_moment / torch.where(visible, alpha, 1.0), 0.0)
     if background is not None:
-        radiance = radiance + (1.0 - alpha)[:, None] * background.to(torch.float64)
+        radiance = radiance + torch.exp(-optical_depth)[:, None] * background.to(torch.float64)
     count = torch.bincount(ray, minlength=pixels)
     return OracleImage(radiance.reshape(*shape, 3), alpha.reshape(shape), expected.reshape(shape), count.reshape(shape))

@@ -61,6 +61,19 @@ def test_colors_outside_the_unit_interval() -> None:
     assert_gradients(replace(scene, color=scene.color * 10.0 - 4.0), torch.float32, FLOAT32_TOLERANCE)
 
 
+@pytest.mark.parametrize("eye", [(0.0, 0.0, 0.0), (0.0, 0.0, 0.125), (0.0, 0.0625, 0.125), (0.5, 0.0625, 0.03)])
+@pytest.mark.parametrize("per_cell", [False, True])
+def test_camera_exactly_on_a_vertex_edge_or_face(eye: tuple[float, float, float], per_cell: bool) -> None:
+    """The image has a kink there as a function of positions, so those gradients only have to be finite."""
+    scene = make_scene(kuhn_grid((4, 4, 4)), camera_at(eye, 52, (24, 20), 1.5), 52, per_cell=per_cell)
+    weights, expected = oracle_gradients(scene)
+    actual = gradients(scene, torch.float32, weights)
+    for name in ("color", "density"):
+        assert relative_error(actual[name], expected[name]) < FLOAT32_TOLERANCE, name
+    for name in ("vertices", "pose"):
+        assert bool(torch.isfinite(actual[name]).all()), name
+
+
 def test_empty_space_knows_in_which_direction_density_helps() -> None:
     """At zero density colours and positions are without effect, but densities are not."""
     scene = SCENES["jittered"]()
