@@ -19,7 +19,7 @@ setup:
 	@sh scripts/setup.sh
 
 demo: setup
-	$(BIN)/difftetvr fit tooth -o out/demo --overwrite
+	$(BIN)/difftetvr fit tooth -o out/demo --cells 80000 --overwrite
 	@echo 'Pictures (truth | reconstruction | difference) and curves lie in out/demo; model.vtu there opens in ParaView.'
 
 test: lint

@@ -1,4 +1,4 @@
-"""Constants of the float32 optics, from benchmarks/fit_optics_coefficients.py; not to be edited by hand."""
+"""Constants of the float32 optics, from scripts/fit_optics_coefficients.py; not to be edited by hand."""
 
 THIN = 1.5
 VISIBLE = 22.0

@@ -1,6 +1,6 @@
 """Fit the float32 constants of the exact optics and print the module that holds them.
 
-    python benchmarks/fit_optics_coefficients.py > src/difftetvr/optics/coefficients.py
+    python scripts/fit_optics_coefficients.py > src/difftetvr/optics/coefficients.py
     ruff format src/difftetvr/optics/coefficients.py
 
 Polynomials: least squares on Chebyshev points, reweighted until the largest error is smallest (Lawson). Quadrature
@@ -146,7 +146,7 @@ def main() -> None:
         "WEIGHTS": rounded(weights),
     }
     print(
-        '"""Constants of the float32 optics, from benchmarks/fit_optics_coefficients.py; not to be edited by hand."""'
+        '"""Constants of the float32 optics, from scripts/fit_optics_coefficients.py; not to be edited by hand."""'
     )
     print(f"\nTHIN = {THIN}\nVISIBLE = {VISIBLE}")
     for name, value in tables.items():

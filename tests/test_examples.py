@@ -1,0 +1,57 @@
+"""The examples and the manual's code run as they stand."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+TUTORIAL = re.findall(r"^```python\n(.*?)^```$", (ROOT / "docs" / "tutorial.md").read_text(), re.MULTILINE | re.DOTALL)
+
+
+def run(*command: str, folder: Path) -> str:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT / "src"), "OMP_NUM_THREADS": "1"}
+    done = subprocess.run([sys.executable, *command], cwd=folder, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def last_number(output: str, pattern: str) -> float:
+    return float(re.findall(pattern, output)[-1])
+
+
+def test_render_mesh(tmp_path):
+    run(str(ROOT / "examples" / "render_mesh.py"), str(tmp_path), folder=tmp_path)
+    assert (tmp_path / "render_mesh.png").stat().st_size > 10_000
+    assert (tmp_path / "render_mesh.vtu").exists()
+
+
+def test_fit_volume(tmp_path):
+    output = run(str(ROOT / "examples" / "fit_volume.py"), str(tmp_path), folder=tmp_path)
+    assert last_number(output, r"PSNR ([\d.]+)") > 23.0
+
+
+def test_recover_pose(tmp_path):
+    output = run(str(ROOT / "examples" / "recover_pose.py"), folder=tmp_path)
+    assert last_number(output, r"off by ([\d.]+)") < 0.002
+
+
+def test_own_training_loop(tmp_path):
+    output = run(str(ROOT / "examples" / "own_training_loop.py"), folder=tmp_path)
+    assert last_number(output, r"PSNR ([\d.]+)") > 22.0
+
+
+def test_every_example_is_tested_and_short():
+    tests = Path(__file__).read_text()
+    for example in EXAMPLES:
+        assert f"def test_{example.stem}(" in tests
+        assert len(example.read_text().splitlines()) <= 60
+
+
+@pytest.mark.parametrize("code", TUTORIAL)
+def test_code_of_the_tutorial(code, tmp_path):
+    run("-c", code, folder=tmp_path)
