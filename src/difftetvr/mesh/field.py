@@ -83,6 +83,9 @@ class Field:
         """
         location = self.location_on(mesh)
         color, density = self.color.detach(), self.density.detach()
+        # Sums and minima carry NaN and infinity along: two fast passes where all is well, the culprit only if not.
+        if bool(torch.isfinite(color.sum() + density.sum()) & (density.amin() >= 0)):
+            return
         _refuse_first(~torch.isfinite(color).all(1), color, f"color of {location}", "make every color finite")
         _refuse_first(~torch.isfinite(density), density, f"density of {location}", "make every density finite")
         _refuse_first(density < 0, density, f"density of {location}", "densities must not be negative")

@@ -50,8 +50,9 @@ class Gradients:
     """Flat gradient buffers.
 
     Attributes:
-        field: (V, 4) or (T, 4): red, green, blue, density.
-        vertices: (V, 4): x, y, z in camera space and padding; None if positions need no gradient.
+        field: (N, 4): red, green, blue, density of at least V vertices or T cells.
+        vertices: (N, 4): x, y, z in camera space and padding; None if positions need no gradient.
+        mode: How additions of several rays to one record are reduced.
     """
 
     field: Any
@@ -82,6 +83,12 @@ class PixelAdjoint:
     distance: Any | None
 
 
+def _buffer_length(count: int) -> int:
+    """A length of at least ``count`` out of few, four an octave: per-thread copies bake it into the kernel."""
+    step = 1 << max(0, count.bit_length() - 3)
+    return -(-count // step) * step
+
+
 def reduce_mode(scene: MarchingScene, floats: int) -> dr.ReduceMode:
     """On CPUs one gradient copy a thread beats atomics, as long as the copies fit a budget."""
     if scene.backend.name != "llvm":
@@ -100,11 +107,12 @@ def render_adjoint(scene: MarchingScene, image: ImageAdjoint, vertex_count: int,
         with_vertices: Whether positions need gradients; the kernel is cheaper without.
     """
     real = scene.backend.Float
-    field_count = vertex_count if scene.cells is None else dr.width(scene.cells) // 4
+    field_count = _buffer_length(vertex_count if scene.cells is None else dr.width(scene.cells) // 4)
+    position_count = _buffer_length(vertex_count) if with_vertices else 0
     gradients = Gradients(
         dr.zeros(real, 4 * field_count),
-        dr.zeros(real, 4 * vertex_count) if with_vertices else None,
-        reduce_mode(scene, 4 * field_count + (4 * vertex_count if with_vertices else 0)),
+        dr.zeros(real, 4 * position_count) if with_vertices else None,
+        reduce_mode(scene, 4 * (field_count + position_count)),
     )
     kernel = _AdjointKernel(scene, gradients, make_rays(scene), image)
     walk(scene, kernel.rays, kernel.read, kernel.visit, kernel.leave, kernel.start())

@@ -83,6 +83,10 @@ def render(
         optics = ConstantPerCell() if per_cell else ExactLinear()
     task = MarchingTask(backend, mesh, camera, optics, per_cell, transmittance_threshold, deterministic)
     vertices = camera.to_camera_space(mesh.vertices)
+    if not bool(torch.isfinite(vertices.detach().sum())):
+        bad = torch.nonzero(~torch.isfinite(mesh.vertices.detach()).all(dim=1)).flatten().tolist()
+        where = f"Vertex {bad[0]} of the mesh" if bad else "A vertex, seen from the camera,"
+        raise MeshError(f"{where} is not finite; check what moved it.")
     color, density = field.color.to(backend.dtype), field.density.to(backend.dtype)
     light, distance = MarchingFunction.apply(task, vertices, color, density)
     return _compose(light, distance, background)

@@ -14,7 +14,7 @@ from difftetvr.optics import OpticalModel
 from difftetvr.render.adjoint import ImageAdjoint, render_adjoint
 from difftetvr.render.camera import Camera
 from difftetvr.render.entry import find_entries
-from difftetvr.render.marching import MarchingScene, render_forward
+from difftetvr.render.marching import MarchingScene, render_forward, vertex_records
 from difftetvr.render.walk import walk_table
 
 
@@ -33,18 +33,17 @@ class MarchingTask:
     def scene(self, vertices: torch.Tensor, color: torch.Tensor, density: torch.Tensor) -> MarchingScene:
         """Upload a view: (V, 3) vertices in camera space, (N, 3) colours and (N,) densities of vertices or cells."""
         backend = self.backend
-        padding = vertices.new_zeros(vertices.shape[0], 1)
         if self.per_cell:
-            records = torch.cat([vertices, padding], dim=1)
+            records = backend.floats(torch.cat([vertices, vertices.new_zeros(vertices.shape[0], 1)], dim=1))
             cells = backend.floats(torch.cat([color, density[:, None]], dim=1))
         else:
-            records = torch.cat([vertices, density[:, None], color, padding], dim=1)
+            records = vertex_records(backend, *(backend.floats(part) for part in (vertices, density, color)))
             cells = None
         return MarchingScene(
             backend,
             self.camera,
             self.optics,
-            backend.floats(records),
+            records,
             cells,
             backend.uints(walk_table(self.mesh)),
             find_entries(backend, self.mesh, vertices, self.camera),
@@ -63,7 +62,8 @@ class MarchingFunction(torch.autograd.Function):
         size = (task.camera.height, task.camera.width)
         image = task.backend.tensor(light, *size, 4), task.backend.tensor(distance, *size)
         ctx.set_materialize_grads(False)
-        ctx.task, ctx.scene, ctx.vertex_count = task, scene, vertices.shape[0]
+        ctx.task, ctx.scene = task, scene
+        ctx.vertex_count, ctx.field_count = vertices.shape[0], density.shape[0]
         ctx.save_for_backward(*image)
         return image
 
@@ -82,6 +82,6 @@ class MarchingFunction(torch.autograd.Function):
         )
         with backend.one_thread(ctx.task.deterministic):
             gradients = render_adjoint(ctx.scene, image, ctx.vertex_count, needs_vertices)
-        field = backend.tensor(gradients.field).reshape(-1, 4)
-        vertices = backend.tensor(gradients.vertices).reshape(-1, 4)[:, :3] if needs_vertices else None
+        field = backend.tensor(gradients.field).reshape(-1, 4)[: ctx.field_count]
+        vertices = backend.tensor(gradients.vertices).reshape(-1, 4)[: ctx.vertex_count, :3] if needs_vertices else None
         return None, vertices, field[:, :3] if needs_color else None, field[:, 3] if needs_density else None

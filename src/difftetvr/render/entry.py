@@ -140,8 +140,8 @@ def find_entries(backend: Backend, mesh: TetMesh, camera_vertices: torch.Tensor,
 def _cells_around_camera(backend: Backend, mesh: TetMesh, camera_vertices: torch.Tensor) -> torch.Tensor | None:
     """Cells that may hold the camera: it lies in them or very near; None if there are none."""
     positions = camera_vertices.detach()
-    lower, upper = positions.amin(dim=0), positions.amax(dim=0)
-    if not bool(((lower <= 0) & (upper >= 0)).all()):
+    # One axis after the other: most cameras look at the mesh from outside, and z says so.
+    if any(bool((positions[:, axis].amin() > 0) | (positions[:, axis].amax() < 0)) for axis in (2, 0, 1)):
         return None
     vertices, tets = backend.floats(positions), backend.uints(mesh.tets)
     cell = dr.arange(backend.UInt, mesh.num_cells)
