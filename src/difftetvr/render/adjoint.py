@@ -19,6 +19,7 @@ from difftetvr.render.marching import (
     Rays,
     Step,
     corner_of,
+    inverse_length,
     make_rays,
     read_vertex,
     walk,
@@ -201,7 +202,7 @@ class _AdjointKernel:
     ) -> tuple[list[Any], list[Any]]:
         """Derivatives at a clipped crossing's true entry and exit; the start itself stays at the camera."""
         t0, t1 = entry[0], leaving[0]
-        inverse = dr.rcp(dr.fmax(t1 - t0, 1e-30))
+        inverse = inverse_length(t0, t1)
         dx = sum((g * (v1 - v0) for g, v0, v1 in zip(at_start[1:], entry[1:], leaving[1:], strict=True)), t0 * 0.0)
         dx = dr.select(clip.x < 1.0, dx * inverse * inverse, 0.0)
         entry_gradient = [dr.select(clip.clipped, -t1 * dx, at_start[0])]

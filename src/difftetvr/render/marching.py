@@ -178,6 +178,11 @@ def corner_of(frame: Frame, vertex: Any, record: Any, values: list[Any], adjoint
     return Corner(vertex, a, b, [t, *values], [zero for _ in range(adjoints)])
 
 
+def inverse_length(t0: Any, t1: Any) -> Any:
+    """One over the length of a crossing, 1 where rounding leaves none."""
+    return 1.0 / dr.select(t1 > t0, t1 - t0, 1.0)
+
+
 @dataclass
 class Clip:
     """The part of a crossing in front of the camera: x = 0 keeps all of it."""
@@ -189,7 +194,7 @@ class Clip:
     def at_camera(t0: Any, t1: Any) -> Clip:
         """Clip a crossing from t0 to t1 at t = 0."""
         clipped = t0 < 0
-        x = dr.select(clipped, dr.fmin(-t0 / dr.fmax(t1 - t0, 1e-30), 1.0), 0.0)
+        x = dr.select(clipped, dr.fmin(-t0 * inverse_length(t0, t1), 1.0), 0.0)
         return Clip(x, clipped)
 
     def apply(self, entry: list[Any], leaving: list[Any]) -> list[Any]:
