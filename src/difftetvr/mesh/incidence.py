@@ -1,0 +1,127 @@
+"""Which edges a cell has and which cells a vertex has, as tables for code that changes meshes."""
+
+from __future__ import annotations
+
+import torch
+
+from difftetvr.errors import MeshError
+from difftetvr.mesh.arrays import chunks, put, sort_keys
+from difftetvr.mesh.topology import LOCAL_EDGES, Topology
+
+_KEY_BITS = 63
+
+
+def cell_edges(topology: Topology) -> torch.Tensor:
+    """The six edges of each cell; built once and kept with the topology.
+
+    Args:
+        topology: The cells.
+
+    Returns:
+        (T, 6) int32 indices into `topology.edges`, in the order of `LOCAL_EDGES`.
+    """
+    return topology.cached("incidence.cell_edges", lambda: _build_cell_edges(topology))
+
+
+def find_edges(topology: Topology, ends: torch.Tensor) -> torch.Tensor:
+    """Look edges up by their ends.
+
+    Args:
+        topology: The cells.
+        ends: (N, 2) int64 vertex indices in range, in either order.
+
+    Returns:
+        (N,) int64 indices into `topology.edges`, -1 where two vertices share no edge.
+    """
+    edges = topology.edges
+    if not edges.shape[0]:
+        return torch.full_like(ends[:, 0], -1)
+    known = topology.cached("incidence.edge_keys", lambda: _edge_keys(edges.long()))
+    keys = _edge_keys(ends.sort(1).values)
+    found = torch.searchsorted(known, keys).clamp_max_(known.shape[0] - 1)
+    return torch.where(known[found] == keys, found, -1)
+
+
+def known_edges(topology: Topology, edges: torch.Tensor) -> torch.Tensor:
+    """Look edges up that a caller says are there.
+
+    Args:
+        topology: The cells.
+        edges: (N, 2) int64 vertex indices in range, in either order.
+
+    Returns:
+        (N,) int64 indices into `topology.edges`.
+
+    Raises:
+        MeshError: Names the first pair of vertices that share no edge.
+    """
+    found = find_edges(topology, edges)
+    if (found < 0).any():
+        one, other = edges[found < 0][0].tolist()
+        raise MeshError(f"The vertices {one} and {other} share no edge; pass pairs that are edges of the mesh.")
+    return found
+
+
+def boundary_vertices(topology: Topology) -> torch.Tensor:
+    """Which vertices lie on faces of one cell only.
+
+    Args:
+        topology: The cells.
+
+    Returns:
+        (V,) bool.
+    """
+    mask = torch.zeros(topology.num_vertices, dtype=torch.bool, device=topology.tets.device)
+    mask[topology.boundary_faces.view(-1).long()] = True
+    return mask
+
+
+def stars(topology: Topology, vertices: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """The cells around vertices, in one list.
+
+    Args:
+        topology: The cells.
+        vertices: (N,) int64 vertex indices; repetitions allowed.
+
+    Returns:
+        owner (M,) int64 ascending, the row of `vertices`, and cells (M,) int64, a cell around that vertex.
+    """
+    offsets, cells = topology.vertex_cells
+    starts = offsets[vertices].long()
+    counts = offsets[vertices + 1].long() - starts
+    owner = torch.repeat_interleave(counts)
+    # Position within the own star = position in the list - where the own star begins in the list.
+    shift = starts - (counts.cumsum(0) - counts)
+    return owner, cells[torch.arange(owner.shape[0], device=owner.device) + shift[owner]].long()
+
+
+def _edge_keys(ends: torch.Tensor) -> torch.Tensor:
+    return (ends[:, 0] << 32) | ends[:, 1]
+
+
+def _build_cell_edges(topology: Topology) -> torch.Tensor:
+    tets = topology.tets
+    vertex_bits = max((topology.num_vertices - 1).bit_length(), 1)
+    id_bits = max((6 * tets.shape[0] - 1).bit_length(), 1)
+    fits = 2 * vertex_bits + id_bits <= _KEY_BITS
+    keys = torch.empty((tets.shape[0], 6), dtype=torch.int64, device=tets.device)
+    for part in chunks(tets.shape[0], tets.device, width=6):
+        corners = tets[part].long().unbind(1)
+        for k, (i, j) in enumerate(LOCAL_EDGES):
+            low, high = torch.minimum(corners[i], corners[j]), torch.maximum(corners[i], corners[j])
+            keys[part, k] = (low << vertex_bits) | high
+    flat = keys.view(-1)
+    if fits:
+        # Keys that carry their own place are sorted without a permutation: ten times faster on a CPU.
+        for part in chunks(flat.shape[0], flat.device):
+            flat[part] = (flat[part] << id_bits) | torch.arange(part.start, part.stop, device=flat.device)
+        flat = sort_keys(flat)
+        places = flat & ((1 << id_bits) - 1)
+        flat >>= id_bits
+    else:
+        flat, places = torch.sort(flat)
+    starts = torch.ones(flat.shape[0], dtype=torch.int32, device=flat.device)
+    starts[1:] = flat[1:] != flat[:-1]
+    table = torch.empty(flat.shape[0], dtype=torch.int32, device=flat.device)
+    put(table, places, starts.cumsum(0, dtype=torch.int32) - 1)
+    return table.view(-1, 6)
