@@ -9,8 +9,8 @@ from difftetvr.view.pictures import save_png
 
 def main(folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    # A volume of your own: VolumeCaptureConfig(path="scan.nrrd", transfer_function="tf.json").
-    capture = dtv.VolumeCaptureConfig(path="tooth", views=20, width=64, height=64).build()
+    # A volume of your own: VolumeCapture(path="scan.nrrd", transfer_function="tf.json").
+    capture = dtv.VolumeCapture(path="tooth", views=20, width=64, height=64).build()
     result = dtv.fit(capture, dtv.FitConfig(cells=5_000, iterations=150))
 
     view = int(capture.test_indices[0])

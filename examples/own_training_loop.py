@@ -6,7 +6,7 @@ import difftetvr as dtv
 
 
 def main() -> None:
-    capture = dtv.VolumeCaptureConfig(path="tooth", views=16, width=48, height=48).build()
+    capture = dtv.VolumeCapture(path="tooth", views=16, width=48, height=48).build()
     lower, upper = capture.bounds.tolist()
     mesh = dtv.TetMesh.grid((5, 5, 8), lower, upper)
 

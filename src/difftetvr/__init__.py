@@ -4,11 +4,11 @@ From a mesh with colour and density and a camera to an image, and from the deriv
 colours, densities, vertex positions and camera poses; from images to a tetrahedral volume.
 """
 
-from difftetvr.capture import Capture, TransferFunction, Volume, VolumeCaptureConfig, load_capture
+from difftetvr.capture import Capture, TransferFunction, Volume, VolumeCapture, load_capture
 from difftetvr.errors import BackendError, CameraError, CaptureError, DiffTetError, MeshError
-from difftetvr.fit import FitConfig, FitResult, fit
+from difftetvr.fit import FitConfig, FitError, FitResult, fit
 from difftetvr.mesh import Field, TetMesh
-from difftetvr.mesh.io import load, save
+from difftetvr.mesh.io import load, load_mesh, save
 from difftetvr.render import Camera, RenderedImage, render
 
 __all__ = [
@@ -20,16 +20,18 @@ __all__ = [
     "DiffTetError",
     "Field",
     "FitConfig",
+    "FitError",
     "FitResult",
     "MeshError",
     "RenderedImage",
     "TetMesh",
     "TransferFunction",
     "Volume",
-    "VolumeCaptureConfig",
+    "VolumeCapture",
     "fit",
     "load",
     "load_capture",
+    "load_mesh",
     "render",
     "save",
 ]

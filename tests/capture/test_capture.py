@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from difftetvr.capture import Capture, VolumeCaptureConfig, fibonacci_orbit, load_capture
+from difftetvr.capture import Capture, VolumeCapture, fibonacci_orbit, load_capture
 from difftetvr.errors import CaptureError
 
 SMALL = {"views": 10, "width": 12, "height": 8, "steps_per_unit": 200.0}
@@ -34,11 +34,11 @@ def example(**changes) -> Capture:
 
 
 def test_tooth_is_the_standard_benchmark(tooth: Capture) -> None:
-    config = VolumeCaptureConfig()
-    assert (config.views, config.width, config.height, config.radius) == (80, 128, 128, 1.2)
-    assert (config.attenuation, config.steps_per_unit) == (25.0, 2500.0)
-    assert len(config.cameras()) == 80
-    assert config.cameras()[0].fy == pytest.approx(128.0)
+    defaults = VolumeCapture()
+    assert (defaults.views, defaults.width, defaults.height, defaults.radius) == (80, 128, 128, 1.2)
+    assert (defaults.attenuation, defaults.steps_per_unit) == (25.0, 2500.0)
+    assert len(defaults.cameras()) == 80
+    assert defaults.cameras()[0].fy == pytest.approx(128.0)
     assert tooth.test_indices.tolist() == [2, 7]
     assert tooth.train_indices.tolist() == [0, 1, 3, 4, 5, 6, 8, 9]
     assert tooth.density_unit == 25.0 and tooth.name == "tooth"

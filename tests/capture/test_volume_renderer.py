@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 import torch
 
-from difftetvr.capture import TransferFunction, Volume, VolumeCaptureConfig, VolumeRenderer, fibonacci_orbit
+from difftetvr.capture import TransferFunction, Volume, VolumeCapture, VolumeRenderer, fibonacci_orbit
 from difftetvr.errors import CaptureError
 from difftetvr.render.camera import Camera
 
 sys.path.append(str(Path(__file__).parent))
 import volume_reference as reference
 
-TOOTH, TOOTH_FUNCTION = VolumeCaptureConfig().load_volume()
+TOOTH, TOOTH_FUNCTION = VolumeCapture().load_volume()
 
 
 def random_scene(seed: int, knots: int = 6) -> tuple[Volume, TransferFunction]:

@@ -2,9 +2,9 @@
 
 import pytest
 
-from difftetvr.capture import VolumeCaptureConfig
+from difftetvr.capture import VolumeCapture
 
 
 @pytest.fixture(scope="session")
 def small_capture():
-    return VolumeCaptureConfig(views=10, width=24, height=24, steps_per_unit=300.0).build()
+    return VolumeCapture(views=10, width=24, height=24, steps_per_unit=300.0).build()

@@ -82,9 +82,9 @@ def test_transparent_intervals_match_dense_sampling() -> None:
 
 
 def test_packaged_tooth_function_takes_stored_colors() -> None:
-    from difftetvr.capture import VolumeCaptureConfig
+    from difftetvr.capture import VolumeCapture
 
-    _, function = VolumeCaptureConfig().load_volume()
+    _, function = VolumeCapture().load_volume()
     color, opacity = function(np.array([0.43534138798713684, 0.7287114858627319]))
     np.testing.assert_allclose(opacity, [0.42, 1.0], atol=1e-6)
     np.testing.assert_allclose(color[1], [0.0882354, 0.2276888, 1.0], atol=1e-6)

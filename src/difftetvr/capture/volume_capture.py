@@ -25,7 +25,7 @@ _TOOTH_TRANSFER_FUNCTION = "tooth3gauss.json"
 
 
 @dataclass(frozen=True)
-class VolumeCaptureConfig:
+class VolumeCapture:
     """A volume, its transfer function and the views to render; the defaults are the standard Tooth benchmark.
 
     Attributes:
