@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import platform
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -24,6 +25,7 @@ tell_drjit()  # before the first import of Dr.Jit, which looks for libLLVM only 
 import drjit as dr  # noqa: E402
 
 _DEVICE_BACKENDS = {"cpu": "llvm", "cuda": "cuda", "mps": "metal"}
+_TURN = threading.RLock()
 _DTYPES = {torch.float32: "", torch.float64: "64"}
 
 
@@ -97,20 +99,25 @@ class Backend:
         return tensor.reshape(shape) if shape else tensor
 
     @contextmanager
-    def one_thread(self, active: bool) -> Iterator[None]:
-        """Run kernels on one CPU thread while active, so that sums over rays are taken in a fixed order.
+    def exclusive(self, one_thread: bool = False) -> Iterator[None]:
+        """Run kernels while no other Python thread does.
 
-        Has no effect on GPUs, whose atomic additions have no order.
+        Dr.Jit's pool of threads is one a process, and kernels use all of it, so renderings take turns.
+
+        Args:
+            one_thread: Run them on one CPU thread, so that sums over rays are taken in a fixed order. Has no effect on
+                GPUs, whose atomic additions have no order.
         """
-        threads = dr.thread_count() if active and self.name == "llvm" else 0
-        if threads:
-            dr.set_thread_count(1)
-        try:
-            yield
-        finally:
+        with _TURN:
+            threads = dr.thread_count() if one_thread and self.name == "llvm" else 0
             if threads:
-                dr.sync_thread()
-                dr.set_thread_count(threads)
+                dr.set_thread_count(1)
+            try:
+                yield
+            finally:
+                if threads:
+                    dr.sync_thread()
+                    dr.set_thread_count(threads)
 
     def _await_torch(self) -> None:
         # Torch and Dr.Jit run on streams of their own.

@@ -85,7 +85,8 @@ class VolumeRenderer:
         order = _pixel_order(width, height)
         images = torch.empty((len(cameras), height * width, 4), dtype=self._backend.dtype)
         for chunk in _chunks(len(cameras), max(1, _MAX_RAYS // (width * height))):
-            images[chunk.start : chunk.stop] = self._launch(cameras[chunk.start : chunk.stop], order)
+            with self._backend.exclusive():
+                images[chunk.start : chunk.stop] = self._launch(cameras[chunk.start : chunk.stop], order)
             if progress is not None:
                 progress(chunk.stop, len(cameras))
         images = images.reshape(len(cameras), height, width, 4)

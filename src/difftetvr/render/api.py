@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +16,7 @@ from difftetvr.render.autograd import MarchingFunction, MarchingTask
 from difftetvr.render.camera import Camera
 
 RENDERERS = ("marching",)
+_SMALL = 1e-6  # within this and its inverse, coordinates are left as they are
 
 
 @dataclass(frozen=True)
@@ -72,32 +74,57 @@ def render(
     if not 0.0 <= transmittance_threshold < 1.0:
         raise DiffTetError(f"transmittance_threshold is {transmittance_threshold}; it must lie in [0, 1).")
     per_cell = field.location_on(mesh) == "cell"
-    field.validate(mesh)
     for name, tensor in (("color", field.color), ("density", field.density)):
         if tensor.device != mesh.vertices.device:
             raise MeshError(
                 f"The field's {name} is on '{tensor.device}', the mesh on '{mesh.vertices.device}'; move one of them."
             )
     backend = backend_for(mesh.vertices)
+    field = field.to(dtype=backend.dtype)
+    field.validate(mesh)
+    behind = None if background is None else _background(background, mesh.vertices)
     if optics is None:
         optics = ConstantPerCell() if per_cell else ExactLinear()
     task = MarchingTask(backend, mesh, camera, optics, per_cell, transmittance_threshold, deterministic)
-    vertices = camera.to_camera_space(mesh.vertices)
-    if not bool(torch.isfinite(vertices.detach().sum())):
+    vertices, unit = _unit_of_length(camera.to_camera_space(mesh.vertices), mesh)
+    light, distance = MarchingFunction.apply(task, vertices, field.color, _times(field.density, unit))
+    return _compose(light, _times(distance, unit), behind)
+
+
+def _background(background: Any, like: torch.Tensor) -> torch.Tensor:
+    try:
+        behind = torch.as_tensor(background, dtype=like.dtype, device=like.device)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise DiffTetError(f"background is {background!r}; give three linear RGB components.") from error
+    if behind.shape != (3,) or not bool(torch.isfinite(behind.detach()).all()):
+        raise DiffTetError(f"background is {background!r}; give three finite linear RGB components.")
+    return behind
+
+
+def _unit_of_length(vertices: torch.Tensor, mesh: TetMesh) -> tuple[torch.Tensor, float]:
+    """Camera-space vertices in a unit in which float32 products of them neither vanish nor overflow, and that unit.
+
+    The unit is a power of two, so nothing is rounded, and 1 for all meshes of common sizes.
+    """
+    low, high = torch.aminmax(vertices.detach())
+    largest = max(-float(low), float(high))
+    if not math.isfinite(largest):
         bad = torch.nonzero(~torch.isfinite(mesh.vertices.detach()).all(dim=1)).flatten().tolist()
         where = f"Vertex {bad[0]} of the mesh" if bad else "A vertex, seen from the camera,"
         raise MeshError(f"{where} is not finite; check what moved it.")
-    color, density = field.color.to(backend.dtype), field.density.to(backend.dtype)
-    light, distance = MarchingFunction.apply(task, vertices, color, density)
-    return _compose(light, distance, background)
+    if largest == 0.0 or _SMALL < largest < 1.0 / _SMALL:
+        return vertices, 1.0
+    unit = 2.0 ** math.frexp(largest)[1]
+    return vertices / unit, unit
 
 
-def _compose(light: Any, distance: Any, background: Any) -> RenderedImage:
+def _times(values: torch.Tensor, unit: float) -> torch.Tensor:
+    return values if unit == 1.0 else values * unit
+
+
+def _compose(light: torch.Tensor, distance: torch.Tensor, behind: torch.Tensor | None) -> RenderedImage:
     color, transmittance = light[..., :3], light[..., 3]
-    if background is not None:
-        behind = torch.as_tensor(background, dtype=color.dtype, device=color.device)
-        if behind.shape != (3,):
-            raise DiffTetError(f"background has shape {tuple(behind.shape)}; give three linear RGB components.")
+    if behind is not None:
         color = color + transmittance[..., None] * behind
     alpha = 1.0 - transmittance
     visible = alpha > 0

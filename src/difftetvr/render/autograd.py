@@ -57,10 +57,11 @@ class MarchingFunction(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, task: MarchingTask, vertices: Any, color: Any, density: Any) -> Any:
         """Render; keeps only the image and, while gradients are wanted, the uploaded scene."""
-        scene = task.scene(vertices, color, density)
-        light, distance = render_forward(scene)
         size = (task.camera.height, task.camera.width)
-        image = task.backend.tensor(light, *size, 4), task.backend.tensor(distance, *size)
+        with task.backend.exclusive():
+            scene = task.scene(vertices, color, density)
+            light, distance = render_forward(scene)
+            image = task.backend.tensor(light, *size, 4), task.backend.tensor(distance, *size)
         ctx.set_materialize_grads(False)
         ctx.task, ctx.scene = task, scene
         ctx.vertex_count, ctx.field_count = vertices.shape[0], density.shape[0]
@@ -74,14 +75,16 @@ class MarchingFunction(torch.autograd.Function):
         backend = ctx.task.backend
         light, distance = ctx.saved_tensors
         needs_vertices, needs_color, needs_density = ctx.needs_input_grad[1:]
-        image = ImageAdjoint(
-            backend.floats(torch.zeros_like(light) if g_light is None else g_light),
-            None if g_distance is None else backend.floats(g_distance),
-            backend.floats(light),
-            backend.floats(distance),
-        )
-        with backend.one_thread(ctx.task.deterministic):
+        with backend.exclusive(one_thread=ctx.task.deterministic):
+            image = ImageAdjoint(
+                backend.floats(torch.zeros_like(light) if g_light is None else g_light),
+                None if g_distance is None else backend.floats(g_distance),
+                backend.floats(light),
+                backend.floats(distance),
+            )
             gradients = render_adjoint(ctx.scene, image, ctx.vertex_count, needs_vertices)
-        field = backend.tensor(gradients.field).reshape(-1, 4)[: ctx.field_count]
-        vertices = backend.tensor(gradients.vertices).reshape(-1, 4)[: ctx.vertex_count, :3] if needs_vertices else None
+            field = backend.tensor(gradients.field).reshape(-1, 4)[: ctx.field_count]
+            vertices = backend.tensor(gradients.vertices).reshape(-1, 4)[:, :3] if needs_vertices else None
+        if vertices is not None:
+            vertices = vertices[: ctx.vertex_count]
         return None, vertices, field[:, :3] if needs_color else None, field[:, 3] if needs_density else None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -11,6 +12,7 @@ import torch
 from difftetvr.errors import CameraError
 
 _ORTHONORMALITY_TOLERANCE = 1e-3
+_MOST_PIXELS = 1 << 28  # four floats a pixel stay within the kernels' 32-bit indices
 
 Vector = Sequence[float] | torch.Tensor
 
@@ -49,12 +51,18 @@ class Camera:
         object.__setattr__(self, "world_to_camera", pose)
         if pose.shape != (4, 4):
             raise CameraError(f"world_to_camera has shape {tuple(pose.shape)}; give a (4, 4) matrix.")
+        for name in ("fx", "fy", "cx", "cy"):
+            object.__setattr__(self, name, _number(name, getattr(self, name)))
+        for name in ("width", "height"):
+            object.__setattr__(self, name, _size(name, getattr(self, name)))
         if not all(math.isfinite(v) for v in (self.fx, self.fy, self.cx, self.cy)):
             raise CameraError("A focal length or principal point is not finite; give finite pixel values.")
         if self.fx <= 0 or self.fy <= 0:
             raise CameraError(f"Focal lengths are ({self.fx}, {self.fy}) pixels; both must be greater than 0.")
-        if self.width < 1 or self.height < 1:
-            raise CameraError(f"The image size is {self.width} x {self.height} pixels; both must be at least 1.")
+        if self.width * self.height > _MOST_PIXELS:
+            raise CameraError(
+                f"The image size is {self.width} x {self.height} pixels; take at most {_MOST_PIXELS:,} in all."
+            )
         values = pose.detach().to("cpu", torch.float64)
         if not bool(torch.isfinite(values).all()):
             raise CameraError("world_to_camera holds a value that is not finite; give a rigid transform.")
@@ -89,11 +97,14 @@ class Camera:
         Raises:
             CameraError: The points coincide, ``up`` is parallel to the view, or a value is out of range.
         """
+        fov_y, width, height = _number("fov_y", fov_y), _size("width", width), _size("height", height)
         if not 0.0 < fov_y < math.pi:
             raise CameraError(f"fov_y is {fov_y} radians; it must lie between 0 and pi.")
         origin, center, upward = (torch.as_tensor(v, dtype=torch.float64).reshape(-1) for v in (eye, target, up))
         if any(v.numel() != 3 for v in (origin, center, upward)):
             raise CameraError("eye, target and up must each have three components.")
+        if not all(bool(torch.isfinite(v).all()) for v in (origin, center, upward)):
+            raise CameraError("A component of eye, target or up is not finite; give finite world-space values.")
         forward = center - origin
         right = torch.linalg.cross(forward, upward)
         if not right.norm() > 1e-9 * forward.norm() * upward.norm():
@@ -142,3 +153,20 @@ class Camera:
     def with_pose(self, world_to_camera: torch.Tensor) -> Camera:
         """The same intrinsics with other extrinsics."""
         return replace(self, world_to_camera=world_to_camera)
+
+
+def _number(name: str, value: object) -> float:
+    try:
+        return float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError) as error:
+        raise CameraError(f"The camera's {name} is {value!r}; give a number.") from error
+
+
+def _size(name: str, value: object) -> int:
+    try:
+        pixels = operator.index(value)  # type: ignore[arg-type]
+    except TypeError as error:
+        raise CameraError(f"The camera's {name} is {value!r}; give a whole number of pixels.") from error
+    if pixels < 1:
+        raise CameraError(f"The camera's {name} is {pixels} pixels; it must be at least 1.")
+    return pixels
