@@ -95,3 +95,24 @@ def test_camera_of_wrong_size_or_type(change: dict[str, object]) -> None:
 def test_eye_that_is_not_finite() -> None:
     with pytest.raises(CameraError, match="finite"):
         Camera.look_at((float("nan"), 0, 0), (0, 0, 1))
+
+
+def test_thin_medium_keeps_its_digits() -> None:
+    """1 - T would be 0 here; alpha and the expected depth come from the optical depth instead."""
+    mesh, field, camera = scene()
+    thick = render(mesh, field, camera)
+    thin = render(mesh, Field(field.color, 1e-9 * field.density), camera)
+    seen = thick.optical_depth > 1e-3
+    assert torch.allclose(thin.optical_depth[seen], 1e-9 * thick.optical_depth[seen], rtol=1e-4)
+    assert torch.allclose(thin.alpha[seen], thin.optical_depth[seen], rtol=1e-4)
+    assert thin.depth[seen].min() > 0.5
+
+
+def test_optical_depth_is_linear_in_density() -> None:
+    mesh, field, camera = scene(dtype=torch.float64)
+    density = field.density.clone().requires_grad_()
+    image = render(mesh, Field(field.color, density), camera)
+    image.optical_depth.sum().backward()
+    assert density.grad is not None
+    assert torch.allclose((density.grad * density).sum(), image.optical_depth.sum())
+    assert torch.allclose(image.alpha, 1.0 - torch.exp(-image.optical_depth))

@@ -34,9 +34,9 @@ class ImageAdjoint:
     """Flat derivatives of the loss with respect to the kernel's outputs, and those outputs.
 
     Attributes:
-        light: (H, W, 4) derivatives with respect to radiance and transmittance.
+        light: (H, W, 4) derivatives with respect to radiance and optical depth.
         distance: (H, W) derivatives with respect to the integral of distance; None if they are all zero.
-        out_light: (H, W, 4) radiance and transmittance.
+        out_light: (H, W, 4) radiance and optical depth.
         out_distance: (H, W) integral of distance.
     """
 
@@ -81,6 +81,7 @@ class PixelAdjoint:
     """Derivatives of the loss with respect to one pixel; distance is None where the loss does not depend on it."""
 
     color: list[Any]
+    optical_depth: Any
     distance: Any | None
 
 
@@ -129,8 +130,8 @@ class _AdjointKernel:
         backend, pixel, valid = scene.backend, rays.pixel, rays.valid
         light = dr.gather(backend.Float4, image.light, pixel, valid)
         seen = dr.gather(backend.Float4, image.out_light, pixel, valid)
-        self.rest = sum((light[k] * seen[k] for k in range(1, 4)), light[0] * seen[0])
-        self.pixel = PixelAdjoint([light[0], light[1], light[2]], None)
+        self.rest = sum((light[k] * seen[k] for k in range(1, 3)), light[0] * seen[0])
+        self.pixel = PixelAdjoint([light[0], light[1], light[2]], light[3], None)
         if image.distance is not None:
             self.pixel.distance = dr.gather(backend.Float, image.distance, pixel, valid)
             far = dr.gather(backend.Float, image.out_distance, pixel, valid)
@@ -187,7 +188,7 @@ class _AdjointKernel:
         w0, w1, transmittance, d_length, d_s0, d_s1 = self.scene.optics.adjoint(length, s0, s1, g0, g1, type(length)(0))
         rest = ray.rest - dr.fma(w0, g0, w1 * g1)
         # All that is still ahead is seen through this cell: its optical depth L (s0 + s1) / 2 dims the rest.
-        half = 0.5 * rest
+        half = 0.5 * (rest - self.pixel.optical_depth)
         d_length = dr.select(t1 > t0, dr.fma(-half, s0 + s1, d_length), 0.0)
         d_s0, d_s1 = dr.fma(-half, length, d_s0), dr.fma(-half, length, d_s1)
         w0, w1 = w0 * ray.transmittance, w1 * ray.transmittance

@@ -27,11 +27,13 @@ class RenderedImage:
         color: (H, W, 3) premultiplied radiance, linear RGB, composited over the background.
         alpha: (H, W) opacity in [0, 1]: one minus the transmittance of the whole ray.
         depth: (H, W) expected distance from the camera at which light is absorbed, in world units; 0 where alpha is 0.
+        optical_depth: (H, W) integral of the density along the ray: what a tomograph measures.
     """
 
     color: torch.Tensor
     alpha: torch.Tensor
     depth: torch.Tensor
+    optical_depth: torch.Tensor
 
 
 def render(
@@ -123,10 +125,10 @@ def _times(values: torch.Tensor, unit: float) -> torch.Tensor:
 
 
 def _compose(light: torch.Tensor, distance: torch.Tensor, behind: torch.Tensor | None) -> RenderedImage:
-    color, transmittance = light[..., :3], light[..., 3]
+    color, optical_depth = light[..., :3], light[..., 3]
     if behind is not None:
-        color = color + transmittance[..., None] * behind
-    alpha = 1.0 - transmittance
+        color = color + torch.exp(-optical_depth)[..., None] * behind
+    alpha = -torch.expm1(-optical_depth)
     visible = alpha > 0
     depth = torch.where(visible, distance / torch.where(visible, alpha, 1.0), 0.0)
-    return RenderedImage(color, alpha, depth)
+    return RenderedImage(color, alpha, depth, optical_depth)

@@ -52,7 +52,7 @@ class MarchingTask:
 
 
 class MarchingFunction(torch.autograd.Function):
-    """(V, 3) camera-space vertices, colours, densities to (H, W, 4) radiance with transmittance, (H, W) distance."""
+    """(V, 3) camera-space vertices, colours, densities to (H, W, 4) radiance and optical depth, (H, W) distance."""
 
     @staticmethod
     def forward(ctx: Any, task: MarchingTask, vertices: Any, color: Any, density: Any) -> Any:

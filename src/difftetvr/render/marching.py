@@ -69,10 +69,18 @@ def vertex_records(backend: Backend, vertices: Any, density: Any, color: Any) ->
 
 @dataclass
 class Radiance:
-    """What a ray has gathered: premultiplied radiance (3), the integral of distance, and the transmittance left."""
+    """What a ray has gathered.
+
+    Attributes:
+        color: Premultiplied radiance, three components.
+        distance: Integral of the distance at which light is absorbed.
+        optical_depth: Optical depth; beside the transmittance, since 1 - exp(-x) of a thin medium needs it.
+        transmittance: Its exponential, the part of light still to come.
+    """
 
     color: list[Any]
     distance: Any
+    optical_depth: Any
     transmittance: Any
 
 
@@ -206,7 +214,7 @@ def render_forward(scene: MarchingScene) -> tuple[Any, Any]:
     """Render a view.
 
     Returns:
-        Flat arrays: (H, W, 4) premultiplied radiance and transmittance, (H, W) integral of the distance.
+        Flat arrays: (H, W, 4) premultiplied radiance and optical depth, (H, W) integral of the distance.
     """
     backend = scene.backend
     real, pixels = backend.Float, scene.camera.width * scene.camera.height
@@ -228,13 +236,15 @@ def render_forward(scene: MarchingScene) -> tuple[Any, Any]:
         w0, w1 = w0 * ray.transmittance, w1 * ray.transmittance
         color = [dr.fma(w0, c0, dr.fma(w1, c1, c)) for c0, c1, c in zip(entry[2:], leaving[2:], ray.color, strict=True)]
         distance = dr.fma(w0, entry[0], dr.fma(w1, leaving[0], ray.distance))
-        return Radiance(color, distance, ray.transmittance * transmittance)
+        optical_depth = dr.fma(0.5 * length, entry[1] + leaving[1], ray.optical_depth)
+        return Radiance(color, distance, optical_depth, ray.transmittance * transmittance)
 
     lanes = dr.width(rays.pixel)
-    start = Radiance([dr.zeros(real, lanes) for _ in range(3)], dr.zeros(real, lanes), dr.ones(real, lanes))
+    zeros = [dr.zeros(real, lanes) for _ in range(5)]
+    start = Radiance(zeros[:3], zeros[3], zeros[4], dr.ones(real, lanes))
     ray = walk(scene, rays, read, visit, lambda face, ray, active: ray, start)
     light, distance = dr.empty(real, 4 * pixels), dr.empty(real, pixels)
-    dr.scatter(light, backend.Float4(*ray.color, ray.transmittance), rays.pixel, rays.valid)
+    dr.scatter(light, backend.Float4(*ray.color, ray.optical_depth), rays.pixel, rays.valid)
     dr.scatter(distance, ray.distance, rays.pixel, rays.valid)
     backend.run(light, distance)
     return light, distance
