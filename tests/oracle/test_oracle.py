@@ -32,7 +32,7 @@ def camera_in_double(camera: Camera) -> Camera:
 
 
 def closed_form(length: float, s0: float, s1: float) -> tuple[float, float, float]:
-    """Weights of the entry and exit colour, and the transmittance, by the special functions of DESIGN section 4."""
+    """Weights of the entry and exit colour, and the transmittance, by scaled error functions and Dawson's integral."""
     u, v = length * s0, 0.5 * length * (s1 - s0)
     transmittance = math.exp(-u - v)
     root = math.sqrt(abs(v))

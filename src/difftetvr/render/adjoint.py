@@ -174,8 +174,8 @@ class _AdjointKernel:
             True,
         )
         step.exit.carry_adjoints(step.face, step.next_face)
-        zero = ray.rest * 0.0
-        return AdjointRay(ray.transmittance, ray.rest, [*at_end, *(zero for _ in range(3 - len(at_end)))])
+        unused = [dr.zeros_like(ray.rest) for _ in range(3 - len(at_end))]
+        return AdjointRay(ray.transmittance, ray.rest, at_end + unused)
 
     def _cross(self, start: list[Any], end: list[Any], ray: AdjointRay) -> tuple[AdjointRay, list[Any], list[Any]]:
         """Adjoint of one cell: derivatives with respect to (distance, density, radiance) at its start and end."""
@@ -218,7 +218,7 @@ class _AdjointKernel:
         self._distribute(face, carry)
         for corner in face.corners:
             self._scatter(corner.vertex, corner.adjoints, active)
-        return AdjointRay(ray.transmittance, ray.rest, [c * 0.0 for c in ray.carry])
+        return AdjointRay(ray.transmittance, ray.rest, [dr.zeros_like(c) for c in ray.carry])
 
     def _distribute(self, face: Face, crossing: list[Any]) -> None:
         """Add a crossing's derivatives to the accumulators of its face's corners."""
@@ -241,7 +241,7 @@ class _AdjointKernel:
             self._scatter_field(vertex, adjoints[0], adjoints[1], active)
         if self.gradients.vertices is not None:
             position = self.rays.frame.to_camera_space(*adjoints[self.field_slots :])
-            self._scatter_record(self.gradients.vertices, vertex, [*position, position[0] * 0.0], active)
+            self._scatter_record(self.gradients.vertices, vertex, [*position, type(position[0])(0)], active)
 
     def _scatter_field(self, index: Any, radiance: Any, density: Any, active: Any) -> None:
         record = [radiance * g for g in self.pixel.color] + [density]
@@ -255,7 +255,7 @@ def _slope(face: Face, crossing: list[Any]) -> tuple[Any, Any]:
     """Slope over the ray's plane of the face's linear interpolant of <crossing, values>.
 
     Moving the face by (da, db) against the ray changes the crossing's value by minus this slope times the move, which
-    is where the hit point's own motion enters (DESIGN section 5: w_k (-H_a, -H_b, g_t)).
+    is where the hit point's own motion enters: with this slope H a corner gets w_k (-H_a, -H_b, g_t).
     """
     a, b, c = face.corners
     total = face.edges[0] + face.edges[1] + face.edges[2]
