@@ -5,6 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from difftetvr import TetMesh
+from difftetvr.errors import MeshError
 from difftetvr.mesh.boundary import BoundaryConstraint
 from difftetvr.mesh.motion import MotionLimits, cap_move, guard_move
 from difftetvr.mesh.quality import quality, volumes
@@ -164,6 +165,12 @@ def test_cells_too_thin_for_float64_hold_their_vertices():
     for _ in range(50):
         move = torch.from_numpy(rng.normal(size=(4, 3))) * 10.0 ** rng.uniform(-17, 1)
         mesh.with_vertices(guard_move(mesh, move).vertices).validate()
+
+
+@pytest.mark.parametrize("limit", [{"volume_ratio": 0.0}, {"volume_ratio": 1.0}, {"quality": 1.0}, {"halvings": -1}])
+def test_refuses_limits_out_of_range(limit):
+    with pytest.raises(MeshError, match="out of range"):
+        MotionLimits(**limit)
 
 
 def test_unused_vertices_move_freely():
