@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from difftetvr.errors import CaptureError, DiffTetError, MeshError
-from difftetvr.files import atomic_write
+from difftetvr.files import atomic_write, require_writable, require_writable_folder
 
 
 def names(folder: Path) -> list[str]:
@@ -121,6 +121,37 @@ def test_impossible_targets_give_one_sentence_of_the_given_kind(tmp_path, bad_ta
     assert os.path.exists(os.devnull) and not os.path.isfile(os.devnull)
 
 
+@pytest.mark.parametrize(
+    "bad_target", [fail_in_missing_folder, fail_on_folder, fail_below_file, fail_on_device, fail_on_long_name]
+)
+def test_impossible_targets_are_known_beforehand_by_the_same_sentence(tmp_path, bad_target):
+    target = bad_target(tmp_path)
+    before = names(tmp_path)
+    with pytest.raises(CaptureError) as late, atomic_write(target, CaptureError):
+        pytest.fail("the body must not run")
+    with pytest.raises(CaptureError) as early:
+        require_writable(target, CaptureError)
+    assert str(early.value) == str(late.value)
+    assert names(tmp_path) == before
+
+
+def test_the_check_leaves_possible_targets_as_they_are(tmp_path):
+    (tmp_path / "old.json").write_text("old")
+    require_writable(tmp_path / "old.json")
+    require_writable(tmp_path / "new.json")
+    require_writable_folder(tmp_path)
+    require_writable_folder(tmp_path / "new" / "folder")
+    assert names(tmp_path) == ["old.json"]
+    assert (tmp_path / "old.json").read_text() == "old"
+
+
+def test_folders_that_cannot_be(tmp_path):
+    (tmp_path / "file").write_text("")
+    for folder in (tmp_path / "file", tmp_path / "file" / "a" / "b", Path("/proc/a/b")):
+        with pytest.raises(MeshError, match=f"Cannot write {folder}: "):
+            require_writable_folder(folder, MeshError)
+
+
 @pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write everywhere")
 def test_no_permission(tmp_path):
     tmp_path.chmod(0o500)
@@ -153,7 +184,7 @@ def test_a_limit_on_file_sizes_met_in_the_body(tmp_path):
 SAVE_ON_FULL_DISK = """
 import sys
 from difftetvr.errors import MeshError
-from difftetvr.files import atomic_write
+from difftetvr.files import atomic_write, require_writable, require_writable_folder
 try:
     with atomic_write(sys.argv[1] + "/a.vtu", MeshError) as temporary:
         temporary.write_bytes(bytes(1_000_000))
@@ -174,3 +205,20 @@ def test_a_disk_that_is_really_full(tmp_path):
         pytest.skip("mounting is not allowed here")
     sentence = f"Cannot write {tmp_path}/a.vtu: no space left on device; free some space or choose another disk.\n"
     assert (done.stdout, done.stderr) == (sentence, "")
+
+
+def test_a_body_that_does_not_know_why_it_failed(tmp_path):
+    """numpy's tofile says how much it wrote of how much, but not what stopped it."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
+    try:
+        with (
+            pytest.raises(MeshError, match="file too large; raise the limit"),
+            atomic_write(tmp_path / "a.vtk", MeshError),
+        ):
+            raise OSError("4860 requested and 0 written")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    with pytest.raises(MeshError, match="4860 requested and 0 written; check"), atomic_write(tmp_path / "a", MeshError):
+        raise OSError("4860 requested and 0 written")
+    assert names(tmp_path) == []

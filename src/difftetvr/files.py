@@ -26,6 +26,7 @@ _ADVICE = {
     errno.EPERM: "choose a folder you may write to",
     errno.EROFS: "choose a disk that is not read-only",
 }
+_PROBE_BYTES = 2**20
 _OTHER_ADVICE = "check the disk or choose another folder"
 
 
@@ -55,10 +56,10 @@ def atomic_write(
         ...     temporary.write_bytes(data)
     """
     target = Path(os.path.realpath(path))
-    temporary = target.with_name(f".{target.stem[:40]}-{secrets.token_hex(4)}{target.suffix}")
+    temporary = _temporary_name(target)
     try:
         mode = _replaceable_mode(target)
-        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+        _create(temporary)
         yield temporary
         if fsync:
             _flush_to_disk(temporary)
@@ -66,11 +67,77 @@ def atomic_write(
             os.chmod(temporary, mode)
         os.replace(temporary, target)
     except OSError as problem:
-        raise error(_sentence(path, problem)) from problem
+        # Libraries that count what they wrote, as numpy does, do not say why it was too little; the disk does.
+        cause = problem if problem.errno else _reason_to_stop(temporary) or problem
+        raise error(_sentence(path, cause)) from problem
     finally:
         # After a successful replace there is nothing left to remove.
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+def require_writable(path: str | os.PathLike[str], error: type[DiffTetError] = DiffTetError) -> None:
+    """Checks that :func:`atomic_write` can begin, before the time to make the content is spent; leaves no trace.
+
+    Args:
+        path: The file to write.
+        error: The exception to raise.
+
+    Raises:
+        DiffTetError: (of type ``error``) There is no such folder, it is not writable, or ``path`` is no ordinary file.
+    """
+    target = Path(os.path.realpath(path))
+    try:
+        _replaceable_mode(target)
+        _probe(target)
+    except OSError as problem:
+        raise error(_sentence(path, problem)) from problem
+
+
+def require_writable_folder(path: str | os.PathLike[str], error: type[DiffTetError] = DiffTetError) -> None:
+    """Checks that files can be created in a folder, or that it can be created where there is none; leaves no trace.
+
+    Args:
+        path: The folder.
+        error: The exception to raise.
+
+    Raises:
+        DiffTetError: (of type ``error``) It, or the nearest folder above that exists, is no folder or not writable.
+    """
+    folder = Path(os.path.realpath(path))
+    try:
+        while not folder.exists() and folder != folder.parent:
+            folder = folder.parent
+        _probe(folder / "probe")
+    except OSError as problem:
+        raise error(_sentence(path, problem)) from problem
+
+
+def _temporary_name(target: Path) -> Path:
+    return target.with_name(f".{target.stem[:40]}-{secrets.token_hex(4)}{target.suffix}")
+
+
+def _create(temporary: Path) -> None:
+    os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+
+
+def _probe(target: Path) -> None:
+    """Creates and removes a file beside ``target``."""
+    temporary = _temporary_name(target)
+    _create(temporary)
+    temporary.unlink()
+
+
+def _reason_to_stop(temporary: Path) -> OSError | None:
+    """What keeps a file from growing, None if nothing does."""
+    try:
+        with temporary.open("ab", buffering=0) as file:
+            written = file.write(bytes(_PROBE_BYTES))
+            if written < _PROBE_BYTES:
+                file.write(bytes(_PROBE_BYTES - written))
+    except OSError as reason:
+        return reason
+    return None
 
 
 def _flush_to_disk(path: Path) -> None:

@@ -11,7 +11,15 @@ from pathlib import Path
 
 import numpy as np
 
-from difftetvr.capture.volume_file import RawVolume, byte_count, parse_shape, parse_spacing, read_stream, to_volume
+from difftetvr.capture.volume_file import (
+    RawVolume,
+    byte_count,
+    parse_shape,
+    parse_spacing,
+    read_stream,
+    text_to_volume,
+    to_volume,
+)
 from difftetvr.errors import CaptureError
 
 _MAX_HEADER = 2**20
@@ -117,14 +125,4 @@ def _spacing(path: Path, fields: dict[str, str]) -> tuple[float, float, float]:
 def _read_text(path: Path, start: int, shape: tuple[int, int, int], dtype: np.dtype) -> np.ndarray:
     # A number needs two bytes at least, but nobody writes more than 32.
     text = read_stream(path, "raw", start, 32 * math.prod(shape))
-    try:
-        values = np.array(text.split(), dtype=np.float64)
-    except ValueError:
-        raise CaptureError(f"The text data of '{path}' holds something else than numbers; get the file anew.") from None
-    if values.size != math.prod(shape):
-        raise CaptureError(f"'{path}' holds {values.size} numbers where its header says {math.prod(shape)}.")
-    if dtype.kind in "ui":
-        limits = np.iinfo(dtype)
-        if not ((values >= limits.min) & (values <= limits.max)).all():
-            raise CaptureError(f"'{path}' holds numbers outside the range of its type {dtype.name}.")
-    return values.astype(dtype.newbyteorder("=")).reshape(shape[::-1])
+    return text_to_volume(text, shape, dtype, path)

@@ -112,6 +112,8 @@ def _read(path: Path, shape: Sequence[int] | None, dtype: str | None) -> RawVolu
     name = path.name.lower()
     if not is_volume_file(path):
         raise CaptureError(f"'{path}' is no volume that can be read; give a .raw, .dat, .nrrd, .nhdr or .vti file.")
+    if path.is_dir():
+        raise CaptureError(f"'{path}' is a folder; give the volume file in it.")
     if not path.is_file():
         raise CaptureError(f"There is no file '{path}'; check the path of the volume.")
     if name.endswith((".raw", ".raw.gz", ".raw.xz", ".dat")):

@@ -112,6 +112,27 @@ def read_stream(path: Path, encoding: str, start: int, count: int) -> bytes:
         raise CaptureError(f"Cannot read '{path}': {error.strerror or error}.") from None
 
 
+def text_to_volume(text: str | bytes, shape: tuple[int, int, int], dtype: np.dtype, source: str | Path) -> np.ndarray:
+    """(nz, ny, nx) values in native byte order from exactly as many decimal numbers, separated by white space.
+
+    Raises:
+        CaptureError: There are fewer or more, something else, or integers that the type cannot hold.
+    """
+    try:
+        values = np.array(text.split(), dtype=np.float64)
+    except ValueError:
+        raise CaptureError(f"The text in '{source}' holds something else than numbers; get the file anew.") from None
+    if values.size != math.prod(shape):
+        raise CaptureError(
+            f"'{source}' holds {values.size} numbers where its header says {math.prod(shape)}; get the file anew."
+        )
+    if dtype.kind in "ui":
+        limits = np.iinfo(dtype)
+        if not ((values >= limits.min) & (values <= limits.max)).all():
+            raise CaptureError(f"'{source}' holds numbers outside the range of its type {dtype.name}; correct either.")
+    return values.astype(dtype.newbyteorder("=")).reshape(shape[::-1])
+
+
 def to_volume(data: bytes, shape: tuple[int, int, int], dtype: np.dtype, source: str | Path) -> np.ndarray:
     """(nz, ny, nx) values in native byte order from exactly as many bytes as they need.
 

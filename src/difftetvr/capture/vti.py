@@ -8,7 +8,6 @@ from __future__ import annotations
 import base64
 import binascii
 import lzma
-import math
 import re
 import xml.etree.ElementTree as ElementTree
 import zlib
@@ -18,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from difftetvr.capture.volume_file import RawVolume, byte_count, parse_shape, parse_spacing, to_volume
+from difftetvr.capture.volume_file import RawVolume, byte_count, parse_shape, parse_spacing, text_to_volume, to_volume
 from difftetvr.errors import CaptureError
 
 _TYPES = {
@@ -86,7 +85,7 @@ def read_vti(path: Path) -> RawVolume:
     dtype = np.dtype(layout.order + code)
     count = byte_count(shape, dtype, path)
     if array.get("format") == "ascii":
-        return RawVolume(_text_values(layout, array, dtype, shape), spacing)
+        return RawVolume(text_to_volume(array.text or "", shape, dtype, path), spacing)
     return RawVolume(to_volume(_array_bytes(layout, array, count), shape, dtype, path), spacing)
 
 
@@ -128,22 +127,6 @@ def _point_array(path: Path, piece: ElementTree.Element) -> ElementTree.Element:
         raise CaptureError(f"'{path}' has no point array with one component; give a scalar volume.")
     active = [a for a in scalars if a.get("Name") == data.get("Scalars")]
     return (active or scalars)[0]
-
-
-def _text_values(
-    layout: _Layout, array: ElementTree.Element, dtype: np.dtype, shape: tuple[int, int, int]
-) -> np.ndarray:
-    try:
-        values = np.array((array.text or "").split(), dtype=np.float64)
-    except ValueError:
-        raise layout.damaged("its text holds something else than numbers") from None
-    if values.size != math.prod(shape):
-        raise layout.damaged(f"it holds {values.size} numbers where its extent says {math.prod(shape)}")
-    if dtype.kind in "ui":
-        limits = np.iinfo(dtype)
-        if not ((values >= limits.min) & (values <= limits.max)).all():
-            raise layout.damaged(f"it holds numbers outside the range of {dtype.name}")
-    return values.astype(dtype.newbyteorder("=")).reshape(shape[::-1])
 
 
 def _array_bytes(layout: _Layout, array: ElementTree.Element, count: int) -> bytes:

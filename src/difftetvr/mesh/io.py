@@ -46,10 +46,11 @@ class _Content:
 
 
 def load(path: str | Path, dtype: torch.dtype = torch.float32) -> tuple[TetMesh, Field]:
-    """Reads a tetrahedral mesh with its field.
+    """Reads a tetrahedral mesh with its field; :func:`load_mesh` reads the geometry of a file without one.
 
     Orientation is fixed by :class:`TetMesh`; vertices that no cell uses are dropped with their attributes; points,
-    lines and polygons that lie beside the tetrahedra are left out.
+    lines and polygons that lie beside the tetrahedra are left out. Colours and densities stored as integers are
+    converted as they are, without scaling.
 
     Args:
         path: .vtu, .npz written by :func:`save`, or a format that meshio reads (.vtk, .msh, .xdmf, ...).
@@ -63,8 +64,7 @@ def load(path: str | Path, dtype: torch.dtype = torch.float32) -> tuple[TetMesh,
     mesh, field, found = _load(path, dtype)
     if field is None:
         raise MeshError(
-            f"{path} has no color and density as point or as cell data (found: {found}); "
-            "add both, or read the geometry alone with load_mesh."
+            f"{path} has no color and density as point or as cell data (found: {found}); add both arrays to it."
         )
     return mesh, field
 
@@ -97,7 +97,7 @@ def save(path: str | Path, mesh: TetMesh, field: Field) -> None:
             attributes, or the file cannot be written.
     """
     path = Path(path)
-    require_writable(path)
+    require_writable_format(path)
     suffix = path.suffix.lower()
     location = field.location_on(mesh)
     arrays = {"color": _array(field.color), "density": _array(field.density)}
@@ -110,7 +110,7 @@ def save(path: str | Path, mesh: TetMesh, field: Field) -> None:
             _write_with_meshio(temporary, mesh, arrays, location, suffix)
 
 
-def require_writable(path: Path) -> None:
+def require_writable_format(path: Path) -> None:
     """Checks that the suffix of a path names a format that :func:`save` writes.
 
     Raises:
@@ -164,6 +164,8 @@ def _load(path: Path, dtype: torch.dtype) -> tuple[TetMesh, Field | None, str]:
 
 
 def _read(path: Path) -> _Content:
+    if path.is_dir():
+        raise MeshError(f"{path} is a folder; give the mesh file in it.")
     if not path.is_file():
         raise MeshError(f"There is no mesh file {path}; check the path.")
     reader = _read_npz if path.suffix.lower() == ".npz" else _read_with_meshio
@@ -248,10 +250,10 @@ def _build_field(path: Path, mesh: TetMesh, arrays: list[np.ndarray], location: 
     if density.ndim == 2 and density.shape[1] == 1:
         density = density[:, 0]
     for name, values, shape in (("color", color, (count, 3)), ("density", density, (count,))):
-        if values.shape != shape or values.dtype.kind != "f":
+        if values.shape != shape or values.dtype.kind not in "fiu":
             raise MeshError(
                 f"{path}: the data array '{name}' is {values.dtype} of shape {values.shape}; "
-                f"it must be floating-point of shape {shape}."
+                f"it must be numbers of shape {shape}."
             )
     tensors = [torch.from_numpy(np.array(values, dtype=_native(values))).to(dtype) for values in (color, density)]
     field = Field(tensors[0], tensors[1], location=location)
@@ -263,7 +265,7 @@ def _build_field(path: Path, mesh: TetMesh, arrays: list[np.ndarray], location: 
 
 
 def _native(values: np.ndarray) -> np.dtype:
-    """The floating-point type in native byte order that holds the stored values exactly."""
+    """The floating-point type in native byte order that holds the stored values, integers up to 2^53 exactly."""
     return np.dtype(np.float32 if values.dtype.kind == "f" and values.dtype.itemsize <= 4 else np.float64)
 
 
