@@ -283,3 +283,17 @@ def test_refuses_options_out_of_range(option):
 def test_rate_falls_log_linearly():
     config = VertexOptimizerConfig(rate=0.1, final_rate=0.001)
     assert [config.rate_at(p) for p in (0.0, 0.5, 1.0)] == pytest.approx([0.1, 0.01, 0.001])
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("boundary", ["fixed", "slide"])
+def test_cuda_agrees_with_the_cpu(boundary):
+    mesh = jittered_grid(shape=(5, 4, 4))
+    config = VertexOptimizerConfig(boundary=boundary)
+    cpu, cuda = VertexOptimizer(mesh, config), VertexOptimizer(mesh.to("cuda"), config)
+    for push in gradients(mesh, 6, 5):
+        assert step_with(cpu, push, 0.3) == step_with(cuda, push.cuda(), 0.3)
+    torch.testing.assert_close(cuda.mesh.vertices.cpu(), cpu.mesh.vertices, rtol=0, atol=1e-12)
+    cuda.carry(bisect_edges(cuda.mesh, torch.tensor([5, 40, 90], device="cuda")))
+    step_with(cuda, torch.ones_like(cuda.mesh.vertices))
+    cuda.mesh.validate()

@@ -3,6 +3,19 @@
 from difftetvr.fit.config import FitConfig
 from difftetvr.fit.errors import FitError
 from difftetvr.fit.loop import fit
+from difftetvr.fit.positions import StepReport, VertexOptimizer, VertexOptimizerConfig
+from difftetvr.fit.regularizers import shape_barrier, softplus_regularizer
 from difftetvr.fit.result import FitResult, Progress
 
-__all__ = ["FitConfig", "FitError", "FitResult", "Progress", "fit"]
+__all__ = [
+    "FitConfig",
+    "FitError",
+    "FitResult",
+    "Progress",
+    "StepReport",
+    "VertexOptimizer",
+    "VertexOptimizerConfig",
+    "fit",
+    "shape_barrier",
+    "softplus_regularizer",
+]
