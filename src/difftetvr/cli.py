@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -12,16 +13,22 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import torch
 import tyro
-from rich.console import Console
 from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, arg, subcommand
 
-from difftetvr.errors import DiffTetError
+from difftetvr.errors import CameraError, CaptureError, MeshError
+from difftetvr.files import require_writable
 from difftetvr.fit.config import FitConfig
 from difftetvr.fit.errors import FitError
 from difftetvr.fit.folder import RunFolder, write_json
+from difftetvr.fit.options import options_from_json
+from difftetvr.terminal import console, sentence_for, waiting
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from difftetvr.capture.capture import Capture
+    from difftetvr.fit.loop import Trainer
+    from difftetvr.fit.result import FitResult
     from difftetvr.mesh.field import Field
     from difftetvr.mesh.tetmesh import TetMesh
     from difftetvr.render.camera import Camera
@@ -66,7 +73,7 @@ class CaptureOptions:
         """Reads or renders the capture of that name."""
         from difftetvr.capture import load_capture
 
-        with console.status(f"Preparing the views of {name}"):
+        with waiting(console, f"Preparing the views of {name}"):
             return load_capture(name, **dataclasses.asdict(self))
 
 
@@ -87,28 +94,31 @@ class Fit:
 
     def run(self, console: Console) -> None:
         """Fits, and fills the output folder."""
-        from difftetvr.fit.loop import fit, require_fittable
-        from difftetvr.fit.progress import ProgressDisplay
+        from difftetvr.fit.loop import prepare
         from difftetvr.view.report import write_report
 
         folder = RunFolder(self.output)
         self._require_same_run(folder)
         folder.require_free(resume=self.resume, overwrite=self.overwrite)
         capture = self.views_of.load(self.capture, console)
-        require_fittable(capture, self.config)
-        # Only now: input that cannot be fitted neither leaves a folder behind nor costs the run that is to be replaced.
-        folder.create(overwrite=self.overwrite)
-        write_json(folder.config, self.to_json())
-        try:
-            with ProgressDisplay(console) as display:
-                result = fit(
-                    capture, self.config, checkpoint=folder.checkpoint, resume=self.resume, on_progress=display
-                )
-        except KeyboardInterrupt:
-            console.print(f"Interrupted; continue with: difftetvr fit {self.capture} -o {self.output} --resume")
-            raise
+        trainer = prepare(capture, self.config, resume_from=folder.checkpoint if self.resume else None)
+        # Only now: what cannot even start neither leaves a folder behind nor costs the run that is to be replaced.
+        with folder.occupied(self.to_json(), overwrite=self.overwrite, begun=lambda: trainer.iteration > 0):
+            result = self._optimise(trainer, folder, console)
         write_report(folder, result, capture)
         _print_summary(console, result.metrics, folder)
+
+    def _optimise(self, trainer: Trainer, folder: RunFolder, console: Console) -> FitResult:
+        from difftetvr.fit.loop import optimise
+        from difftetvr.fit.progress import ProgressDisplay
+
+        try:
+            with ProgressDisplay(console) as display:
+                return optimise(trainer, folder.checkpoint, display)
+        except KeyboardInterrupt:
+            command = shlex.join(["difftetvr", "fit", self.capture, "-o", str(self.output), "--resume"])
+            console.print(f"Interrupted; continue with: {command}")
+            raise
 
     def to_json(self) -> dict[str, Any]:
         """The options that make the run what it is."""
@@ -117,24 +127,23 @@ class Fit:
 
     def with_saved_options(self, args: Sequence[str]) -> Fit:
         """This command with the options of the run in the folder wherever ``args`` gives none."""
-        saved = RunFolder(self.output).read_config() if self.resume else None
+        saved = _saved_options(RunFolder(self.output)) if self.resume else None
         if saved is None:
             return self
-        return _parse(Fit, args, dataclasses.replace(self, resume=False, overwrite=False, **_saved_options(saved)))
+        return _parse(Fit, args, dataclasses.replace(self, resume=False, overwrite=False, **saved))
 
     def _require_same_run(self, folder: RunFolder) -> None:
-        saved = folder.read_config() if self.resume else None
+        saved = _saved_options(folder) if self.resume else None
         if saved is None:
             return
-        options = _saved_options(saved)
-        if options["capture"] != self.capture:
+        if saved["capture"] != self.capture:
             raise FitError(
-                f"The run in {self.output} fits '{options['capture']}', not '{self.capture}'; "
+                f"The run in {self.output} fits '{saved['capture']}', not '{self.capture}'; "
                 "resume with the same capture or choose another folder."
             )
-        if options["views_of"] != self.views_of:
+        if saved["views_of"] != self.views_of:
             raise FitError(f"The run in {self.output} has other views; resume with the same options for them.")
-        options["config"].require_same_run(self.config)
+        saved["config"].require_same_run(self.config)
 
 
 @dataclass(frozen=True)
@@ -168,11 +177,22 @@ class Render:
         from difftetvr.view.pictures import require_png, save_png
 
         require_png(self.output)
+        require_writable(self.output, CaptureError)
+        self._require_valid_camera()
         mesh, field_on_mesh = _load_model(self.model, self.device)
         with torch.no_grad():
             image = render(mesh, field_on_mesh, self._camera(mesh), background=torch.tensor(self.background))
         save_png(self.output, image.color)
         console.print(f"Wrote {self.output} ({self.width} x {self.height})")
+
+    def _require_valid_camera(self) -> None:
+        if not 0.0 < self.fov < 180.0:
+            raise CameraError(f"--fov is {self.fov:g} degrees; it must lie between 0 and 180.")
+        for name in ("eye", "target", "up", "background"):
+            values = getattr(self, name)
+            if values is not None and not all(math.isfinite(v) for v in values):
+                given = " ".join(f"{v:g}" for v in values)
+                raise CameraError(f"--{name} is {given}; give three finite numbers.")
 
     def _camera(self, mesh: TetMesh) -> Camera:
         from difftetvr.render.camera import Camera
@@ -212,6 +232,8 @@ class Eval:
         from difftetvr.fit.evaluation import evaluate
         from difftetvr.view.describe import evaluation_table
 
+        if self.output is not None:
+            require_writable(self.output, FitError)
         mesh, field_on_mesh = _load_model(self.model, self.device)
         capture = self.views_of.load(self.capture, console)
         views = list(range(len(capture.cameras))) if self.all_views else capture.test_indices.tolist()
@@ -256,9 +278,10 @@ class Export:
 
     def run(self, console: Console) -> None:
         """Reads and writes."""
-        from difftetvr.mesh.io import load, require_writable, save
+        from difftetvr.mesh.io import load, require_writable_format, save
 
-        require_writable(self.output)
+        require_writable_format(self.output)
+        require_writable(self.output, MeshError)
         mesh, field_on_mesh = load(self.model)
         save(self.output, mesh, field_on_mesh)
         console.print(f"Wrote {self.output} ({mesh.num_cells:,} cells)")
@@ -287,23 +310,18 @@ def main(args: Sequence[str] | None = None) -> int:
         command: Any = _parse(Command, given)
         if isinstance(command, Fit):
             command = command.with_saved_options(given[1:])
-        command.run(Console())
+        command.run(console())
     except SystemExit as leave:
         return leave.code if isinstance(leave.code, int) else _USAGE_ERROR
-    except DiffTetError as error:
-        return _fail(str(error))
-    except OSError as error:
-        return _fail(f"{error.strerror or error}{f': {error.filename}' if error.filename else ''}.")
-    except (MemoryError, torch.OutOfMemoryError):
-        return _fail("There is not enough memory; use fewer cells, or fewer or smaller views.")
     except KeyboardInterrupt:
         return _INTERRUPTED
+    except Exception as error:
+        sentence = sentence_for(error)
+        if sentence is None:
+            raise
+        print(f"difftetvr: {sentence}", file=sys.stderr)
+        return _USAGE_ERROR
     return 0
-
-
-def _fail(sentence: str) -> int:
-    print(f"difftetvr: {sentence}", file=sys.stderr)
-    return _USAGE_ERROR
 
 
 def _parse(command: Any, args: Sequence[str], default: Any = tyro.MISSING) -> Any:
@@ -321,18 +339,16 @@ def _print_summary(console: Console, metrics: dict[str, Any], folder: RunFolder)
         f"Pictures: {folder.comparison} and {folder.views}",
         f"Curves:   {folder.curves}",
     ]
-    console.print("\n".join(lines), highlight=False, soft_wrap=True)
+    console.print("\n".join(lines))
 
 
 def _load_model(path: Path, device: str | None) -> tuple[TetMesh, Field]:
     from difftetvr.fit.loop import resolve_device
-    from difftetvr.mesh.field import Field
     from difftetvr.mesh.io import load
 
-    mesh, on_disk = load(path)
-    mesh = mesh.to(device=resolve_device(device))
-    color, density = (values.to(mesh.vertices.device) for values in (on_disk.color, on_disk.density))
-    return mesh, Field(color, density, location=on_disk.location)
+    mesh, field_on_mesh = load(path)
+    target = resolve_device(device)
+    return mesh.to(device=target), field_on_mesh.to(device=target)
 
 
 def _is_capture(path: Path) -> bool:
@@ -344,16 +360,23 @@ def _is_capture(path: Path) -> bool:
     return str(path) == TOOTH or is_volume_file(path) or is_saved_capture
 
 
-def _saved_options(saved: dict[str, Any]) -> dict[str, Any]:
-    """Fields of :class:`Fit` from the saved options of a run."""
+def _saved_options(folder: RunFolder) -> dict[str, Any] | None:
+    """Fields of :class:`Fit` from the options that the run in a folder was started with; None if there is none."""
+    saved = folder.read_config()
+    if saved is None:
+        return None
     try:
-        views_of: dict[str, Any] = {
-            name: tuple(value) if isinstance(value, list) else value for name, value in saved["capture_options"].items()
-        }
+        if not isinstance(saved["capture"], str):
+            raise FitError("The name of the capture is no text; start anew with --overwrite.")
         return {
-            "capture": str(saved["capture"]),
+            "capture": saved["capture"],
             "config": FitConfig.from_json(saved["fit"]),
-            "views_of": CaptureOptions(**views_of),
+            "views_of": options_from_json(CaptureOptions, saved["capture_options"]),
         }
-    except (KeyError, TypeError, AttributeError) as error:
-        raise FitError(f"The saved options of the run are damaged ({error}); start anew with --overwrite.") from error
+    except (FitError, KeyError) as error:
+        reason = f"It lacks {error}; start anew with --overwrite." if isinstance(error, KeyError) else str(error)
+        raise FitError(f"{folder.config} is damaged, so --resume cannot use it: {reason}") from error
+
+
+if __name__ == "__main__":
+    sys.exit(main())

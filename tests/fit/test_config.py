@@ -85,6 +85,11 @@ def test_given_backgrounds():
         {"background": "grey"},
         {"background": (0.0, 0.0, 2.0)},
         {"grid": (3, 0, 3)},
+        {"cells": 10**23},
+        {"grid": (2**20, 2**20, 2**20)},
+        {"grid": (10**23, 1, 1)},
+        {"iterations": 10**23},
+        {"seed": 10**23},
     ],
 )
 def test_options_out_of_range_are_named(options):
@@ -97,3 +102,38 @@ def test_json_round_trip():
     assert FitConfig.from_json(json.loads(json.dumps(config.to_json()))) == config
     with pytest.raises(FitError, match="'speed'"):
         FitConfig.from_json({"speed": 3})
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"cells": "many"},
+        {"cells": 2.5},
+        {"cells": True},
+        {"cells": None},
+        {"rate": "fast"},
+        {"rate": True},
+        {"betas": [0.9]},
+        {"betas": [0.9, "0.99"]},
+        {"grid": [[1], 2, 3]},
+        {"grid": 3},
+        {"location": 1},
+        {"background": [0.0, 0.5]},
+        {"background": {"r": 1}},
+        {"deterministic": 1},
+        {"device": 0},
+    ],
+)
+def test_saved_options_of_wrong_types_are_named(values):
+    with pytest.raises(FitError, match=f"option {next(iter(values))} is "):
+        FitConfig.from_json(values)
+
+
+@pytest.mark.parametrize("values", [None, 3, "cells", [["cells", 3]]])
+def test_saved_options_that_are_no_object(values):
+    with pytest.raises(FitError, match="no JSON object"):
+        FitConfig.from_json(values)
+
+
+def test_saved_whole_numbers_are_floats_too():
+    assert FitConfig.from_json({"rate": 1, "grid": None, "background": [0, 1, 0]}).background == (0, 1, 0)

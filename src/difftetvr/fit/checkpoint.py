@@ -1,11 +1,13 @@
 """Checkpoints: everything that the rest of a reconstruction depends on, in one safetensors file.
 
 The tensors are the mesh, the parameters, the optimiser's moments and the history; the file's header holds the rest as
-JSON. One file, renamed into place, so that a run killed at any moment leaves the last checkpoint whole.
+JSON, and a checksum of everything, because a run that goes on from a flipped bit would look like any other. One file,
+renamed into place, so that a run killed at any moment leaves the last checkpoint whole.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 from dataclasses import dataclass, field
@@ -17,11 +19,14 @@ import safetensors.torch
 import torch
 
 from difftetvr.capture.capture import Capture
+from difftetvr.errors import MeshError
 from difftetvr.files import atomic_write
 from difftetvr.fit.config import FitConfig
 from difftetvr.fit.errors import FitError
+from difftetvr.mesh.tetmesh import TetMesh
 
-_VERSION = 1
+_VERSION = 2
+_HISTORY = ("history.loss", "history.psnr")
 
 
 @dataclass
@@ -51,6 +56,7 @@ class Checkpoint:
         capture: What :func:`describe_capture` says about the images it runs on.
         tensors: Mesh, parameters and optimiser state by name.
         history: Losses and timings up to here.
+        source: What to call it in messages; the file that it was read from.
     """
 
     iteration: int
@@ -58,6 +64,7 @@ class Checkpoint:
     capture: dict[str, Any]
     tensors: dict[str, torch.Tensor]
     history: History
+    source: str = field(default="checkpoint", compare=False)
 
     def save(self, path: Path) -> None:
         """Writes the checkpoint, whole or not at all.
@@ -74,9 +81,11 @@ class Checkpoint:
             "seconds": self.history.seconds,
         }
         tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in self.tensors.items()}
-        tensors["history.loss"] = torch.tensor(self.history.loss, dtype=torch.float64)
-        tensors["history.psnr"] = torch.tensor(self.history.psnr, dtype=torch.float64)
-        content = safetensors.torch.save(tensors, metadata={"state": json.dumps(state)})
+        for name, values in zip(_HISTORY, (self.history.loss, self.history.psnr), strict=True):
+            tensors[name] = torch.tensor(values, dtype=torch.float64)
+        text = json.dumps(state)
+        metadata = {"state": text, "sha256": _checksum(text, tensors)}
+        content = safetensors.torch.save(tensors, metadata=metadata)
         with atomic_write(path, FitError) as temporary:
             temporary.write_bytes(content)
 
@@ -87,25 +96,101 @@ class Checkpoint:
         Raises:
             FitError: The file is missing, damaged or of another version.
         """
+        require_no_folder(path)
         try:
             with safetensors.safe_open(path, framework="pt") as file:
-                state = json.loads((file.metadata() or {})["state"])
+                metadata = file.metadata() or {}
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-            if state["version"] != _VERSION:
-                raise FitError(
-                    f"The checkpoint {path} has version {state['version']}, this program reads version {_VERSION}; "
-                    "start anew."
-                )
-            history = History(
-                tensors.pop("history.loss").tolist(),
-                tensors.pop("history.psnr").tolist(),
-                [(int(i), float(p)) for i, p in state["evaluations"]],
-                float(state["seconds"]),
+            state = json.loads(metadata["state"])
+            version = state["version"]
+        except (OSError, KeyError, ValueError, TypeError, RecursionError, safetensors.SafetensorError) as error:
+            raise _unreadable(path, _reason(error)) from error
+        if version != _VERSION:
+            raise FitError(
+                f"The checkpoint {path} has version {version}, this program reads version {_VERSION}; start anew."
             )
-            config = FitConfig.from_json(state["config"])
-            return Checkpoint(int(state["iteration"]), config, state["capture"], tensors, history)
-        except (OSError, KeyError, ValueError, TypeError, safetensors.SafetensorError) as error:
-            raise FitError(f"The checkpoint {path} cannot be read ({error}); start anew.") from error
+        if metadata.get("sha256") != _checksum(metadata["state"], tensors):
+            raise _unreadable(path, "its content does not match its checksum")
+        try:
+            return _checkpoint(state, tensors, str(path))
+        except (FitError, KeyError, ValueError, TypeError, AttributeError, OverflowError) as error:
+            raise _unreadable(path, _reason(error)) from error
+
+    def mesh(self) -> TetMesh:
+        """The mesh of the run.
+
+        Raises:
+            FitError: There is none, or it is not valid.
+        """
+        try:
+            return TetMesh(self.tensors["vertices"], self.tensors["tets"])
+        except (KeyError, MeshError) as error:
+            raise _unreadable(self.source, _reason(error)) from error
+
+    def require_tensors_like(self, expected: dict[str, torch.Tensor]) -> None:
+        """Checks that the tensors are those that the run needs.
+
+        Args:
+            expected: Tensors of the right names, shapes and types.
+
+        Raises:
+            FitError: One is missing, or of another shape or type; names the first one.
+        """
+        for name, tensor in expected.items():
+            saved = self.tensors.get(name)
+            if saved is None:
+                raise _unreadable(self.source, f"it lacks '{name}'")
+            if saved.shape != tensor.shape or saved.dtype != tensor.dtype:
+                raise _unreadable(
+                    self.source,
+                    f"'{name}' is {saved.dtype} of shape {tuple(saved.shape)}, not {tensor.dtype} of shape "
+                    f"{tuple(tensor.shape)}",
+                )
+
+
+def require_no_folder(path: Path) -> None:
+    """Checks that a checkpoint can have a name.
+
+    Raises:
+        FitError: It is that of a folder.
+    """
+    if path.is_dir():
+        raise FitError(f"{path} is a folder where the checkpoint should be a file; rename or remove it.")
+
+
+def _checkpoint(state: dict[str, Any], tensors: dict[str, torch.Tensor], source: str) -> Checkpoint:
+    """A checkpoint from the parts of a file; whatever is wrong with them raises one of Python's own errors."""
+    loss, psnr = (tensors.pop(name).tolist() for name in _HISTORY)
+    evaluations = [(int(i), float(p)) for i, p in state["evaluations"]]
+    history = History(loss, psnr, evaluations, float(state["seconds"]))
+    config = FitConfig.from_json(state["config"])
+    iteration, capture = state["iteration"], state["capture"]
+    if not isinstance(iteration, int) or not iteration == len(loss) == len(psnr) <= config.iterations:
+        raise ValueError(f"its history has {len(loss)} losses after {iteration} iterations")
+    if not isinstance(capture, dict):
+        raise TypeError("it does not describe its images")
+    return Checkpoint(iteration, config, capture, tensors, history, source)
+
+
+def _checksum(state: str, tensors: dict[str, torch.Tensor]) -> str:
+    """SHA-256 of the header's state and of every tensor's name, type, shape and bytes."""
+    digest = hashlib.sha256(state.encode())
+    for name in sorted(tensors):
+        tensor = tensors[name]
+        digest.update(f"\n{name} {tensor.dtype} {tuple(tensor.shape)}\n".encode())
+        digest.update(tensor.reshape(-1).numpy().data)
+    return digest.hexdigest()
+
+
+def _reason(error: Exception) -> str:
+    return f"it lacks {error}" if isinstance(error, KeyError) else str(error)
+
+
+def _unreadable(source: str | Path, why: str) -> FitError:
+    why = " ".join(why.split()).rstrip(".")
+    return FitError(
+        f"The checkpoint {source} cannot be read ({why}); start anew, on the command line with --overwrite."
+    )
 
 
 def describe_capture(capture: Capture) -> dict[str, Any]:
@@ -129,7 +214,10 @@ def require_same_capture(saved: dict[str, Any], current: dict[str, Any]) -> None
     """
     for name, value in current.items():
         before = saved.get(name)
-        same = math.isclose(before, value, rel_tol=1e-5) if isinstance(before, float) else before == value
+        if isinstance(before, float) and isinstance(value, float):
+            same = math.isclose(before, value, rel_tol=1e-5)
+        else:
+            same = before == value
         if not same:
             raise FitError(
                 f"The saved run used images with {name} = {before}, these have {value}; "

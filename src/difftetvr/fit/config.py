@@ -11,12 +11,23 @@ from typing import Any, Literal
 import numpy as np
 
 from difftetvr.fit.errors import FitError
+from difftetvr.fit.options import options_from_json
+from difftetvr.mesh.faces import MAX_CELLS
 
 Background = Literal["black", "white", "random"] | tuple[float, float, float]
 
 _CELLS_PER_CUBE = 6
 _BACKGROUND_STREAM = 1
 _BACKGROUND_COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+_LARGEST_COUNT = 2**31 - 1
+# Least and greatest value of options that count something.
+_RANGES = {
+    "cells": (1, MAX_CELLS),
+    "iterations": (1, _LARGEST_COUNT),
+    "batch_views": (1, _LARGEST_COUNT),
+    "evaluate_every": (0, _LARGEST_COUNT),
+    "seed": (0, _LARGEST_COUNT),
+}
 # Options that change nothing about where the optimisation goes: a resumed run may choose them anew.
 _FREE_OPTIONS = frozenset({"device", "evaluate_every", "checkpoint_seconds"})
 
@@ -27,6 +38,8 @@ class FitConfig:
 
     The defaults reconstruct the Tooth benchmark. Rates are steps of Adam per iteration in units of the quantity:
     colours live in [0, 1], densities are counted in units of the capture's density (that of opacity 1 in a volume).
+    No function keeps them in range: after each step they are projected, colours to [0, 1] and densities to [0, inf).
+    Unlike the image of an exponential or a softplus, that range includes 0, so empty space becomes exactly empty.
     """
 
     cells: int = 20_000
@@ -68,8 +81,9 @@ class FitConfig:
     """Seconds between checkpoints."""
 
     def __post_init__(self) -> None:
-        for name, least in (("cells", 1), ("iterations", 1), ("batch_views", 1), ("evaluate_every", 0), ("seed", 0)):
-            _require(getattr(self, name) >= least, name, getattr(self, name), f"at least {least}")
+        for name, (least, most) in _RANGES.items():
+            value = getattr(self, name)
+            _require(least <= value <= most, name, value, f"at least {least} and at most {most}")
         for name in ("rate", "final_rate"):
             _require(_positive(getattr(self, name)), name, getattr(self, name), "greater than 0 and finite")
         for name in ("haze_penalty", "initial_density", "checkpoint_seconds"):
@@ -79,7 +93,10 @@ class FitConfig:
         _require(all(0 <= b < 1 for b in self.betas), "betas", self.betas, "at least 0 and less than 1")
         _require(self.location in ("vertex", "cell"), "location", self.location, "vertex or cell")
         _require(self.loss in ("l1", "l2"), "loss", self.loss, "l1 or l2")
-        _require(self.grid is None or min(self.grid) >= 1, "grid", self.grid, "at least 1 cube along each axis")
+        if self.grid is not None:
+            _require(min(self.grid) >= 1, "grid", self.grid, "at least 1 cube along each axis")
+            fits = math.prod(self.grid) <= MAX_CELLS // _CELLS_PER_CUBE
+            _require(fits, "grid", self.grid, f"at most {MAX_CELLS // _CELLS_PER_CUBE} cubes in all")
         named = isinstance(self.background, str)
         valid = self.background in ("black", "white", "random") if named else _is_color(self.background)
         _require(valid, "background", self.background, "black, white, random or three values in [0, 1]")
@@ -135,18 +152,13 @@ class FitConfig:
         return dataclasses.asdict(self)
 
     @staticmethod
-    def from_json(values: dict[str, Any]) -> FitConfig:
+    def from_json(values: object) -> FitConfig:
         """The inverse of :meth:`to_json`.
 
         Raises:
-            FitError: An option is unknown or out of range.
+            FitError: An option is unknown, of the wrong type or out of range.
         """
-        known = {item.name for item in dataclasses.fields(FitConfig)}
-        unknown = sorted(set(values) - known)
-        if unknown:
-            raise FitError(f"The saved options hold '{unknown[0]}', which this version does not know; start anew.")
-        options: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
-        return FitConfig(**options)
+        return options_from_json(FitConfig, values)
 
     def _view(self, position: int, view_count: int) -> int:
         epoch, offset = divmod(position, view_count)

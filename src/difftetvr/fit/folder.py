@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from difftetvr.files import atomic_write
+from difftetvr.files import atomic_write, require_writable_folder
 from difftetvr.fit.errors import FitError
 
 
@@ -68,7 +71,8 @@ class RunFolder:
             overwrite: The run in the folder will be replaced.
 
         Raises:
-            FitError: The folder holds a run and neither is set, both are, or it is a file.
+            FitError: The folder holds a run and neither is set, both are, it is a file, or nothing can be created
+                in it.
         """
         if resume and overwrite:
             raise FitError("--resume and --overwrite contradict each other; give one of them.")
@@ -79,22 +83,38 @@ class RunFolder:
             )
         if self.path.exists() and not self.path.is_dir():
             raise FitError(f"{self.path} is a file, so no folder can have this name; choose another.")
+        require_writable_folder(self.path, FitError)
 
-    def create(self, *, overwrite: bool) -> None:
-        """Creates the folder where there is none.
+    @contextmanager
+    def occupied(self, options: dict[str, Any], *, overwrite: bool, begun: Callable[[], bool]) -> Iterator[None]:
+        """Context manager for a run in the folder: creates it where there is none, and writes the options.
+
+        When the body raises an error before a new run has begun, everything that this call or the body left is taken
+        back, so that the next attempt finds the folder free.
 
         Args:
-            overwrite: Remove the files of a run in it; others are left alone.
+            options: Of the run, as JSON values.
+            overwrite: Remove the files of a run in it first; others are left alone.
+            begun: Whether the run has got anywhere that is worth keeping.
 
         Raises:
-            FitError: The folder cannot be created or emptied.
+            FitError: The folder cannot be created or emptied, or the options cannot be written.
         """
+        is_new = overwrite or not self.holds_run()
+        absent = [p for p in (self.path, *self.path.parents) if not p.exists()]
         try:
-            self.path.mkdir(parents=True, exist_ok=True)
-            if overwrite:
-                self._clear()
-        except OSError as error:
-            raise FitError(f"The folder {self.path} cannot be used ({error.strerror}); choose another.") from error
+            try:
+                self.path.mkdir(parents=True, exist_ok=True)
+                if overwrite:
+                    self._clear()
+            except OSError as error:
+                raise FitError(f"The folder {self.path} cannot be used ({error.strerror}); choose another.") from error
+            write_json(self.config, options)
+            yield
+        except Exception:
+            if is_new and not begun():
+                self._withdraw(absent)
+            raise
 
     def read_config(self) -> dict[str, Any] | None:
         """Options of the run in the folder, None if it holds none.
@@ -113,11 +133,22 @@ class RunFolder:
         return options
 
     def _clear(self) -> None:
-        for path in (self.config, self.checkpoint, self.model, self.metrics, self.curves, self.comparison):
+        # The checkpoint goes first and the options last: cut short, this never leaves a state to resume from without
+        # the options that it belongs to.
+        for path in (self.checkpoint, self.model, self.metrics, self.curves, self.comparison):
             path.unlink(missing_ok=True)
         for pattern in ("*_truth.png", "*_reconstruction.png"):
             for picture in self.views.glob(pattern):
                 picture.unlink()
+        self.config.unlink(missing_ok=True)
+
+    def _withdraw(self, folders: list[Path]) -> None:
+        """Removes the start of a run, and those of the given folders, innermost first, that are empty then."""
+        with contextlib.suppress(OSError):
+            self.checkpoint.unlink(missing_ok=True)
+            self.config.unlink(missing_ok=True)
+            for folder in folders:
+                folder.rmdir()
 
 
 def write_json(path: Path, values: dict[str, Any]) -> None:

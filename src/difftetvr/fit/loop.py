@@ -10,10 +10,16 @@ from pathlib import Path
 
 import torch
 
-from difftetvr.backend import default_device
+from difftetvr.backend import default_device, get_backend
 from difftetvr.capture.capture import Capture
 from difftetvr.errors import CaptureError
-from difftetvr.fit.checkpoint import Checkpoint, History, describe_capture, require_same_capture
+from difftetvr.fit.checkpoint import (
+    Checkpoint,
+    History,
+    describe_capture,
+    require_no_folder,
+    require_same_capture,
+)
 from difftetvr.fit.config import FitConfig, grid_cubes
 from difftetvr.fit.errors import FitError
 from difftetvr.fit.evaluation import evaluate, true_image
@@ -101,12 +107,12 @@ class Trainer:
         """Goes on from a checkpoint.
 
         Raises:
-            FitError: The checkpoint is of a run with other options or images.
+            FitError: The checkpoint is of a run with other options or images, or lacks something.
         """
         checkpoint.config.require_same_run(config)
-        mesh = TetMesh(checkpoint.tensors["vertices"], checkpoint.tensors["tets"])
-        trainer = Trainer(capture, config, mesh)
+        trainer = Trainer(capture, config, checkpoint.mesh())
         require_same_capture(checkpoint.capture, trainer._capture_description)
+        checkpoint.require_tensors_like(trainer.checkpoint().tensors)
         trainer.parameters.restore(checkpoint.tensors)
         trainer.iteration = checkpoint.iteration
         trainer.history = checkpoint.history
@@ -160,8 +166,8 @@ def fit(
         capture: Cameras and images; those of ``capture.test`` are never trained on.
         config: Options; default: those of the Tooth benchmark.
         mesh: Mesh to put the field on; default: the grid of ``config`` over ``capture.bounds``.
-        checkpoint: File to save the state to every ``config.checkpoint_seconds``, and when interrupted by SIGINT or
-            SIGTERM.
+        checkpoint: File to save the state to before the first iteration, every ``config.checkpoint_seconds``, after the
+            last one, and when interrupted by SIGINT or SIGTERM.
         resume: Go on from ``checkpoint`` if it exists; ``mesh`` is then the checkpoint's.
         on_progress: Called after every iteration.
 
@@ -173,12 +179,48 @@ def fit(
         FitError: The checkpoint cannot be read, written, or is of another run, or the loss is not finite.
         KeyboardInterrupt: The run was interrupted; the checkpoint is saved.
     """
-    config = config or FitConfig()
     path = Path(checkpoint) if checkpoint is not None else None
-    if resume and path is not None and path.exists():
-        trainer = Trainer.resume(capture, config, Checkpoint.load(path))
-    else:
-        trainer = Trainer(capture, config, mesh)
+    trainer = prepare(capture, config or FitConfig(), mesh=mesh, resume_from=path if resume else None)
+    return optimise(trainer, path, on_progress)
+
+
+def prepare(
+    capture: Capture, config: FitConfig, *, mesh: TetMesh | None = None, resume_from: Path | None = None
+) -> Trainer:
+    """The first half of :func:`fit`: everything that can fail before the first iteration, without writing anything.
+
+    Args:
+        capture: Cameras and images.
+        config: Options.
+        mesh: Mesh to put the field on; default: the grid of ``config``.
+        resume_from: Checkpoint to go on from if it exists.
+
+    Raises:
+        CaptureError: The images do not allow what the options ask for.
+        FitError: The checkpoint cannot be read or is of another run, or the device does not exist.
+        MeshError: The grid is too large.
+        BackendError: The device has no back end.
+    """
+    if resume_from is not None and resume_from.exists():
+        return Trainer.resume(capture, config, Checkpoint.load(resume_from))
+    return Trainer(capture, config, mesh)
+
+
+def optimise(
+    trainer: Trainer, path: Path | None = None, on_progress: Callable[[Progress], None] | None = None
+) -> FitResult:
+    """The second half of :func:`fit`: iterates to the end and evaluates.
+
+    Args:
+        trainer: Where to begin.
+        path: Checkpoint to write.
+        on_progress: Called after every iteration.
+
+    Raises:
+        FitError: The checkpoint cannot be written, or the loss is not finite.
+        KeyboardInterrupt: The run was interrupted; the checkpoint is saved.
+    """
+    capture, config = trainer.capture, trainer.config
     held_out = capture.test_indices.tolist()
     with _one_torch_thread():
         _run(trainer, path, on_progress)
@@ -193,7 +235,7 @@ def require_fittable(capture: Capture, config: FitConfig) -> None:
     Raises:
         CaptureError: The images have no alpha but the background needs it.
         FitError: The device does not exist.
-        BackendError: No back end works.
+        BackendError: No back end works, or the device has none.
     """
     if config.needs_alpha and capture.alphas is None:
         raise CaptureError(
@@ -213,6 +255,10 @@ def build_grid(capture: Capture, config: FitConfig) -> TetMesh:
 def _run(trainer: Trainer, path: Path | None, on_progress: Callable[[Progress], None] | None) -> None:
     """Iterates to the end, with glances and checkpoints on the way."""
     config, history = trainer.config, trainer.history
+    if path is not None and trainer.iteration < config.iterations:
+        # A full disk or a forbidden folder is found before the work, not with its result.
+        require_no_folder(path)
+        trainer.checkpoint().save(path)
     start = time.perf_counter() - history.seconds
     saved = time.perf_counter()
     with InterruptFlag(active=path is not None) as interrupt:
@@ -254,7 +300,7 @@ def resolve_device(name: str | None) -> torch.device:
 
     Raises:
         FitError: There is no such device here.
-        BackendError: None works.
+        BackendError: It has no back end, or its back end does not work.
     """
     if name is None:
         return default_device()
@@ -264,4 +310,5 @@ def resolve_device(name: str | None) -> torch.device:
     except (RuntimeError, AssertionError, NotImplementedError) as error:
         reason = str(error).splitlines()[0].rstrip(".")
         raise FitError(f"The device '{name}' cannot be used ({reason}); use cpu, cuda or mps.") from error
+    get_backend(name)
     return device

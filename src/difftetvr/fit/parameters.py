@@ -39,6 +39,13 @@ class FieldParameters:
         self._optimizer = torch.optim.Adam(
             [self.color, self.density], lr=config.rate, betas=config.betas, eps=_EPSILON, fused=True
         )
+        # Adam would make its state in the first step; made here, a checkpoint holds the same arrays from the start.
+        for parameter in (self.color, self.density):
+            self._optimizer.state[parameter] = {
+                "step": torch.zeros((), device=device),
+                "exp_avg": torch.zeros_like(parameter, requires_grad=False),
+                "exp_avg_sq": torch.zeros_like(parameter, requires_grad=False),
+            }
 
     def field(self) -> Field:
         """The field that the parameters stand for, differentiable in them."""
@@ -74,19 +81,19 @@ class FieldParameters:
         """Parameters and optimiser state by name: all that the next step depends on."""
         tensors = dict(self._items())
         for name, parameter in self._items():
-            for key, value in self._optimizer.state.get(parameter, {}).items():
+            for key, value in self._optimizer.state[parameter].items():
                 tensors[f"{name}.{key}"] = value
         return tensors
 
     def restore(self, tensors: dict[str, torch.Tensor]) -> None:
-        """The inverse of :meth:`state`."""
+        """The inverse of :meth:`state`.
+
+        Args:
+            tensors: Of the names, shapes and types of :meth:`state`; others are ignored.
+        """
         with torch.no_grad():
-            for name, parameter in self._items():
-                parameter.copy_(tensors[name])
-                prefix = f"{name}."
-                saved = {k.removeprefix(prefix): v.clone() for k, v in tensors.items() if k.startswith(prefix)}
-                if saved:
-                    self._optimizer.state[parameter] = {k: v.to(parameter.device) for k, v in saved.items()}
+            for name, tensor in self.state().items():
+                tensor.copy_(tensors[name])
 
     def _items(self) -> Iterator[tuple[str, torch.Tensor]]:
         return ((name, getattr(self, name)) for name in _NAMES)

@@ -7,7 +7,6 @@ from types import TracebackType
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
-from rich.text import Text
 
 from difftetvr.fit.result import Progress as Status
 
@@ -23,9 +22,9 @@ class ProgressDisplay:
 
     def __init__(self, console: Console | None = None) -> None:
         self._console = console or Console()
-        columns = (BarColumn(bar_width=24), TextColumn("{task.fields[status]}"))
+        columns = (BarColumn(bar_width=24), TextColumn("{task.fields[status]}", markup=False))
         self._bar = Progress(*columns, console=self._console) if self._console.is_terminal else None
-        self._task = self._bar.add_task("", total=None, status=Text("starting")) if self._bar else None
+        self._task = self._bar.add_task("", total=None, status="starting") if self._bar else None
         self._begin: tuple[float, int] | None = None
         self._line_due = 0.0
 
@@ -49,7 +48,7 @@ class ProgressDisplay:
         elapsed, done = now - self._begin[0], status.iteration - self._begin[1]
         speed = done / elapsed if elapsed > 0 and done else None
         if self._bar and self._task is not None:
-            text = Text(_describe(status, speed))
+            text = _describe(status, speed)
             self._bar.update(self._task, completed=status.iteration, total=status.iterations, status=text)
         elif now >= self._line_due or status.iteration == status.iterations:
             self._line_due = now + _LINE_SECONDS

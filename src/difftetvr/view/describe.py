@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.measure import Measurement
 from rich.table import Table
+from rich.text import Text
 
 from difftetvr.capture.capture import Capture
 from difftetvr.fit.evaluation import Evaluation
@@ -12,6 +17,19 @@ from difftetvr.mesh.tetmesh import TetMesh
 
 _QUALITY_BINS = 10
 _BAR_WIDTH = 30
+
+
+@dataclass(frozen=True)
+class _Bar:
+    """A horizontal bar, of blocks where the output's encoding is known to have them."""
+
+    length: int
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        yield Text(("#" if options.ascii_only else "█") * self.length)
+
+    def __rich_measure__(self, console: Console, options: ConsoleOptions) -> Measurement:
+        return Measurement(self.length, self.length)
 
 
 def mesh_tables(name: str, mesh: TetMesh, field: Field | None) -> list[Table]:
@@ -74,13 +92,14 @@ def _quality_table(mesh: TetMesh) -> Table:
     for column in ("Q", "cells", ""):
         table.add_column(column, justify="left" if not column else "right")
     for i, count in enumerate(counts):
-        bar = "█" * round(_BAR_WIDTH * count / max(counts))
+        bar = _Bar(round(_BAR_WIDTH * count / max(counts)))
         table.add_row(f"{i / _QUALITY_BINS:.1f} - {(i + 1) / _QUALITY_BINS:.1f}", f"{count:,}", bar)
     return table
 
 
 def _table(title: str) -> Table:
-    table = Table(title=title, title_justify="left", show_header=False)
+    # As Text, because rich reads markup in plain strings, and square brackets may be part of a file's name.
+    table = Table(title=Text(title), title_justify="left", show_header=False)
     table.add_column(style="bold")
     table.add_column(overflow="fold")
     return table
