@@ -55,7 +55,7 @@ class MeshChange:
         Raises:
             MeshError: The number of rows is not the old number of vertices.
         """
-        _check_rows(values, self.num_old_vertices, "vertices")
+        check_rows(values, self.num_old_vertices, "vertices")
         first, second = self.parents.unbind(1)
         carried = values.index_select(0, first)
         new = true_indices(self.is_new)
@@ -76,7 +76,7 @@ class MeshChange:
         Raises:
             MeshError: The number of rows is not the old number of cells.
         """
-        _check_rows(values, self.num_old_cells, "cells")
+        check_rows(values, self.num_old_cells, "cells")
         return values.index_select(0, self.cell_parents)
 
 
@@ -164,6 +164,16 @@ def check_indices(indices: torch.Tensor, count: int, what: str) -> torch.Tensor:
     return indices.long()
 
 
-def _check_rows(values: torch.Tensor, count: int, what: str) -> None:
+def check_rows(values: torch.Tensor, count: int, what: str) -> None:
+    """Refuse data that is not that of the old mesh.
+
+    Args:
+        values: What shall be carried.
+        count: The rows it must have.
+        what: What has one row each, for the message: "vertices", "cells".
+
+    Raises:
+        MeshError: The number of rows is another.
+    """
     if values.ndim == 0 or values.shape[0] != count:
         raise MeshError(f"The values have shape {tuple(values.shape)}; pass a row for each of the {count} old {what}.")
