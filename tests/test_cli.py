@@ -1,12 +1,17 @@
 """The commands, from arguments to files and exit codes."""
 
+import errno
+import importlib
 import json
 import os
 import re
+import shlex
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,9 +20,14 @@ from PIL import Image
 
 import difftetvr.cli as cli
 from difftetvr.capture import Capture
+from difftetvr.fit.checkpoint import Checkpoint
+from difftetvr.fit.folder import RunFolder
+from difftetvr.fit.loop import Trainer
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.mesh.io import load, save
+from difftetvr.terminal import sentence_for
 
+LOOP = importlib.import_module("difftetvr.fit.loop")  # difftetvr.fit is the function, too
 VIEWS = ["--views", "10", "--width", "24", "--height", "24"]
 FIT = ["--cells", "500", "--iterations", "4", "--device", "cpu"]
 
@@ -157,7 +167,16 @@ def test_bad_input_is_one_sentence_and_code_2(run, tmp_path, capsys):
     fails(capsys, "render", model, "-o", tmp_path / "a.jpg")
     fails(capsys, "render", model, "-o", tmp_path / "missing" / "a.png", "--width", 8, "--height", 8)
     fails(capsys, "render", model, "-o", tmp_path / "a.png", "--width", 0)
-    fails(capsys, "render", model, "-o", tmp_path / "a.png", "--fov", 200)
+    assert "--fov is 200 degrees" in fails(capsys, "render", model, "-o", tmp_path / "a.png", "--fov", 200)
+    assert "--fov" in fails(capsys, "render", model, "-o", tmp_path / "a.png", "--fov", "nan")
+    for option in ("--eye", "--target", "--up", "--background"):
+        assert f"{option} is nan 0 1" in fails(capsys, "render", model, "-o", tmp_path / "a.png", option, "nan", 0, 1)
+    assert "image size" in fails(capsys, "render", model, "-o", tmp_path / "a.png", "--width", 10**5, "--height", 65000)
+    fails(capsys, "render", model, "-o", tmp_path / "a.png", "--width", 10**30)
+    assert "'meta'" in fails(capsys, "render", model, "-o", tmp_path / "a.png", "--device", "meta")
+    assert "'meta'" in fails(capsys, "fit", "tooth", "-o", out, "--device", "meta", *VIEWS)
+    assert "cells" in fails(capsys, "fit", "tooth", "-o", out, "--cells", 10**23, *VIEWS)
+    assert "folder" in fails(capsys, "info", tmp_path)
     fails(capsys, "eval", model, "nothing.nrrd")
     fails(capsys, "eval", tmp_path / "nothing.vtu", "tooth")
     fails(capsys, "eval", model, "tooth", *VIEWS, "--test-every", 0)
@@ -201,3 +220,208 @@ def test_interrupt_saves_a_checkpoint_and_leaves_with_130(tmp_path):
     assert "Traceback" not in rest
     assert (folder / "checkpoint.safetensors").exists()
     assert not (folder / "model.vtu").exists()
+
+
+def test_outputs_that_cannot_be_written_are_found_before_the_work(run, tmp_path, capsys, monkeypatch):
+    def work(*args, **kwargs):
+        pytest.fail("the work has begun")
+
+    monkeypatch.setattr(cli.CaptureOptions, "load", work)
+    monkeypatch.setattr("difftetvr.mesh.io.load", work)
+    missing, file = tmp_path / "missing", tmp_path / "file"
+    file.write_text("")
+    for arguments in (
+        ["eval", run / "model.vtu", "tooth", "-o", missing / "e.json"],
+        ["render", run / "model.vtu", "-o", missing / "a.png"],
+        ["export", run / "model.vtu", missing / "a.vtk"],
+        ["fit", "tooth", "-o", file / "run"],
+    ):
+        assert "Cannot write" in fails(capsys, *arguments)
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
+MEMORY_ERRORS = [
+    MemoryError(),
+    torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB"),
+    RuntimeError("[enforce fail at alloc_cpu.cpp:124] err == 0. DefaultCPUAllocator: can't allocate memory: you tried"),
+    RuntimeError("jit_malloc(): out of memory! Could not allocate 68719476736 bytes of device memory."),
+    RuntimeError("std::bad_alloc"),
+    OSError(errno.ENOMEM, "Cannot allocate memory"),
+]
+
+
+@pytest.mark.parametrize("error", MEMORY_ERRORS, ids=lambda e: f"{type(e).__name__} {e}"[:40])
+def test_every_shortage_of_memory_is_the_same_sentence(run, capsys, monkeypatch, error):
+    monkeypatch.setattr("difftetvr.mesh.io.load_with_optional_field", raising(error))
+    assert "not enough memory; use fewer cells" in fails(capsys, "info", run / "model.vtu")
+
+
+def test_real_shortages_of_memory_are_recognised():
+    for shortage in (lambda: torch.empty(2**46), lambda: np.empty(2**46), lambda: bytes(2**60)):
+        with pytest.raises((RuntimeError, MemoryError)) as caught:
+            shortage()
+        assert sentence_for(caught.value) == "There is not enough memory; use fewer cells, or fewer or smaller views."
+
+
+def test_mistakes_of_the_program_are_not_hidden(run, monkeypatch):
+    monkeypatch.setattr("difftetvr.mesh.io.load_with_optional_field", raising(RuntimeError("a shape is wrong")))
+    with pytest.raises(RuntimeError, match="a shape is wrong"):
+        cli.main(["info", str(run / "model.vtu")])
+
+
+def raising(error):
+    def fail(*args, **kwargs):
+        raise error
+
+    return fail
+
+
+@pytest.mark.parametrize("error", [MemoryError(), OSError(errno.ENOSPC, "No space left on device")])
+@pytest.mark.parametrize("where", ["prepare", "step", "save"])
+@pytest.mark.parametrize("existing", [False, True])
+def test_a_failed_start_leaves_nothing(tmp_path, capsys, monkeypatch, error, where, existing):
+    """Neither a run that refuses the next attempt nor the folders made for it."""
+    target = {
+        "prepare": (LOOP, "build_grid"),
+        "step": (Trainer, "step"),
+        "save": (Checkpoint, "save"),
+    }[where]
+    folder = tmp_path / "new" / "out"
+    if existing:
+        folder.mkdir(parents=True)
+        (folder / "notes.txt").write_text("mine")
+    before = sorted(tmp_path.rglob("*"))
+    with monkeypatch.context() as patch:
+        patch.setattr(*target, raising(error))
+        fails(capsys, "fit", "tooth", "-o", folder, *VIEWS, *FIT)
+    assert sorted(tmp_path.rglob("*")) == before
+    assert cli.main(["fit", "tooth", "-o", str(folder), *VIEWS, *FIT]) == 0
+
+
+def test_a_failure_later_keeps_what_can_be_resumed(tmp_path, capsys, monkeypatch):
+    step = Trainer.step
+
+    def third_fails(trainer):
+        if trainer.iteration == 2:
+            raise MemoryError
+        step(trainer)
+
+    folder = tmp_path / "out"
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "step", third_fails)
+        fails(capsys, "fit", "tooth", "-o", folder, *VIEWS, *FIT)
+    assert {p.name for p in folder.iterdir()} == {"config.json", "checkpoint.safetensors"}
+    assert "already holds" in fails(capsys, "fit", "tooth", "-o", folder, *VIEWS, *FIT)
+    assert cli.main(["fit", "tooth", "-o", str(folder), "--resume"]) == 0
+
+
+def test_what_cannot_start_does_not_cost_the_run_that_was_to_be_replaced(run, tmp_path, capsys, monkeypatch):
+    folder = tmp_path / "out"
+    shutil.copytree(run, folder)
+    with monkeypatch.context() as patch:
+        patch.setattr(LOOP, "build_grid", raising(MemoryError()))
+        fails(capsys, "fit", "tooth", "-o", folder, *VIEWS, *FIT, "--overwrite")
+    assert {p.name: p.read_bytes() for p in folder.glob("*.*")} == {p.name: p.read_bytes() for p in run.glob("*.*")}
+
+
+def test_overwriting_removes_the_checkpoint_first_and_the_options_last(run, tmp_path, monkeypatch):
+    folder = tmp_path / "out"
+    shutil.copytree(run, folder)
+    removed = []
+    unlink = Path.unlink
+
+    def note(path, missing_ok=False):
+        removed.append(path.name)
+        unlink(path, missing_ok)
+
+    monkeypatch.setattr(Path, "unlink", note)
+    RunFolder(folder)._clear()
+    assert removed[0] == "checkpoint.safetensors"
+    assert removed[-1] == "config.json"
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"capture_options": {"views": "ten"}},
+        {"capture_options": {"views": 10, "colour": 3}},
+        {"capture_options": [10]},
+        {"capture": 3},
+        {"fit": {"cells": "many"}},
+        {"fit": {"cells": -5}},
+        {"fit": None},
+    ],
+)
+def test_damaged_options_of_a_run(run, tmp_path, capsys, change):
+    folder = tmp_path / "out"
+    shutil.copytree(run, folder)
+    saved = json.loads((run / "config.json").read_text())
+    (folder / "config.json").write_text(json.dumps(saved | change))
+    assert f"{folder}/config.json is damaged" in fails(capsys, "fit", "tooth", "-o", folder, "--resume")
+    for name in change:
+        (folder / "config.json").write_text(json.dumps({k: v for k, v in saved.items() if k != name}))
+        assert "lacks" in fails(capsys, "fit", "tooth", "-o", folder, "--resume")
+
+
+def test_folder_in_place_of_the_checkpoint(run, tmp_path, capsys):
+    folder = tmp_path / "out"
+    shutil.copytree(run, folder)
+    (folder / "checkpoint.safetensors").unlink()
+    (folder / "checkpoint.safetensors").mkdir()
+    assert "is a folder where the checkpoint" in fails(capsys, "fit", "tooth", "-o", folder, "--resume")
+
+
+@pytest.mark.parametrize("name", ["d[b].vtu", "[red]x.vtu", "x[bold].vtu", ":apple:.vtu", "d[/b].vtu"])
+def test_names_of_files_are_shown_as_they_are(run, tmp_path, capsys, name):
+    path = tmp_path / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes((run / "model.vtu").read_bytes())
+    assert cli.main(["info", str(path)]) == 0
+    assert name in capsys.readouterr().out
+    assert cli.main(["render", str(path), "-o", f"{path}.png", "--width", "8", "--height", "8"]) == 0
+    assert f"Wrote {path}.png (8 x 8)" in capsys.readouterr().out
+    assert cli.main(["export", str(path), f"{path}.npz"]) == 0
+    assert f"Wrote {path}.npz" in capsys.readouterr().out
+
+
+def test_names_with_line_breaks_stay_one_line(tmp_path, capsys):
+    assert "no\\nthing" in fails(capsys, "info", tmp_path / "no\nthing.vtu")
+
+
+def difftetvr(*args, **environment):
+    """Runs the command line as a process of its own."""
+    source = str(Path(cli.__file__).parents[1])
+    return subprocess.run(
+        [sys.executable, "-m", "difftetvr", *(str(a) for a in args)],
+        capture_output=True,
+        env={**os.environ, "PYTHONPATH": source, **environment},
+    )
+
+
+def test_encodings_without_blocks_and_accents(run, tmp_path):
+    path = tmp_path / "zähne.vtu"
+    path.write_bytes((run / "model.vtu").read_bytes())
+    done = difftetvr("info", path, PYTHONIOENCODING="ascii", PYTHONUTF8="0")
+    assert (done.returncode, done.stderr) == (0, b"")
+    shown = done.stdout.decode("ascii")
+    assert "#####" in shown
+    assert "z\\xe4hne.vtu" in shown
+    assert "█████" in difftetvr("info", path, PYTHONIOENCODING="utf-8").stdout.decode()
+
+
+@pytest.mark.parametrize("module", ["difftetvr", "difftetvr.cli"])
+def test_modules_run(module, tmp_path):
+    source = str(Path(cli.__file__).parents[1])
+    command = [sys.executable, "-m", module, "info", str(tmp_path / "nothing.vtu")]
+    done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": source})
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == f"difftetvr: There is no mesh file {tmp_path}/nothing.vtu; check the path.\n"
+
+
+def test_interrupted_runs_tell_a_command_that_shells_understand(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(LOOP, "optimise", raising(KeyboardInterrupt()))
+    folder = tmp_path / "my [b]run's"
+    assert cli.main(["fit", "tooth", "-o", str(folder), *VIEWS, *FIT]) == 130
+    line = capsys.readouterr().out.strip()
+    command = line.partition("continue with: ")[2]
+    assert shlex.split(command) == ["difftetvr", "fit", "tooth", "-o", str(folder), "--resume"]
