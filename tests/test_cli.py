@@ -245,6 +245,7 @@ MEMORY_ERRORS = [
     torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB"),
     RuntimeError("[enforce fail at alloc_cpu.cpp:124] err == 0. DefaultCPUAllocator: can't allocate memory: you tried"),
     RuntimeError("jit_malloc(): out of memory! Could not allocate 68719476736 bytes of device memory."),
+    RuntimeError("cuda_check(): API error 0002 (CUDA_ERROR_OUT_OF_MEMORY)"),
     RuntimeError("std::bad_alloc"),
     OSError(errno.ENOMEM, "Cannot allocate memory"),
 ]

@@ -18,7 +18,7 @@ from difftetvr.errors import DiffTetError
 _NO_MEMORY = "There is not enough memory; use fewer cells, or fewer or smaller views."
 # Torch's and Dr.Jit's allocators raise RuntimeErrors like any others; only their words tell them apart.
 _ALLOCATION = re.compile(
-    r"DefaultCPUAllocator|(?:can't|cannot|could not|unable to|failed to) allocate|out of memory|not enough memory"
+    r"DefaultCPUAllocator|(?:can't|cannot|could not|unable to|failed to) allocate|out[ _]of[ _]memory|not enough memory"
     r"|bad[_ ]alloc",
     re.IGNORECASE,
 )

@@ -76,6 +76,19 @@ def test_mesh_tables_say_what_the_mesh_holds():
     assert "none (geometry only)" in text_of(*mesh_tables("a.vtu", mesh, None))
 
 
+def test_names_in_tables_are_no_markup():
+    mesh = TetMesh.grid((1, 1, 1))
+    for name in ("d[/b].vtu", "x[bold].vtu", ":apple:.vtu"):
+        assert name in text_of(mesh_tables(name, mesh, None)[0])
+
+
+def test_tables_need_no_more_than_ascii_where_there_is_no_more(tmp_path):
+    with open(tmp_path / "out", "w", encoding="ascii") as file:
+        for table in mesh_tables("a.vtu", TetMesh.grid((2, 2, 2)), None):
+            Console(width=100, file=file).print(table)
+    assert "#" * 30 in (tmp_path / "out").read_text()
+
+
 def test_evaluation_table_has_means():
     text = text_of(evaluation_table(Evaluation([3, 8], [20.0, 30.0], [0.5, 0.7])))
     for expected in ("3", "8", "20.00", "30.00", "mean", "25.00", "0.6000"):
