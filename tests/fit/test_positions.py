@@ -88,7 +88,7 @@ def test_steps_are_zero_where_nothing_is_allowed():
 
 def test_without_gradient_and_barrier_nothing_moves():
     mesh = jittered_grid()
-    optimizer = VertexOptimizer(mesh, VertexOptimizerConfig(barrier=0.0))
+    optimizer = VertexOptimizer(mesh, VertexOptimizerConfig(barrier=0.0, wall=0.0))
     step_with(optimizer, torch.zeros_like(mesh.vertices))
     assert torch.equal(optimizer.mesh.vertices, mesh.vertices)
 
@@ -132,7 +132,7 @@ def test_steps_turn_with_the_mesh(seed, boundary):
 
 def test_a_steady_gradient_moves_by_the_rate_in_altitudes():
     mesh = jittered_grid(shape=(4, 4, 4))
-    optimizer = VertexOptimizer(mesh, VertexOptimizerConfig(barrier=0.0))
+    optimizer = VertexOptimizer(mesh, VertexOptimizerConfig(barrier=0.0, wall=0.0))
     push = torch.ones_like(mesh.vertices)
     report = step_with(optimizer, push, rate=0.02)
     move = torch.linalg.vector_norm(optimizer.mesh.vertices - mesh.vertices, dim=1).detach()
@@ -146,10 +146,10 @@ def test_the_cap_and_the_guard_report_what_they_hold_back():
     mesh = jittered_grid(shape=(4, 4, 4))
     push = gradients(mesh, 0)[0]
     inner = int((~on_box(mesh.vertices).any(1)).sum())
-    capped = VertexOptimizer(mesh, VertexOptimizerConfig(barrier=0.0))
+    capped = VertexOptimizer(mesh, VertexOptimizerConfig(barrier=0.0, wall=0.0))
     assert step_with(capped, push, rate=100.0).capped == inner
     strict = MotionLimits(volume_ratio=0.999)
-    held = VertexOptimizer(mesh, VertexOptimizerConfig(barrier=0.0, limits=strict))
+    held = VertexOptimizer(mesh, VertexOptimizerConfig(barrier=0.0, wall=0.0, limits=strict))
     report = step_with(held, push, rate=100.0)
     assert report.halved + report.refused > inner / 2
     assert report.moved <= inner - report.refused
@@ -163,6 +163,24 @@ def test_barrier_alone_improves_shapes():
         step_with(optimizer, torch.zeros_like(mesh.vertices))
     assert optimizer.mesh.quality().min() > worst
     assert shape_barrier(optimizer.mesh) < total
+
+
+def flattening(config, steps=300):
+    """One inner vertex that the loss pulls straight into a face of the box; returns its optimiser and the reports."""
+    mesh = TetMesh.grid((2, 2, 2), dtype=torch.float64)
+    optimizer = VertexOptimizer(mesh, config)
+    push = torch.zeros_like(mesh.vertices)
+    push[13, 2] = 1.0
+    return optimizer, [step_with(optimizer, push) for _ in range(steps)]
+
+
+def test_the_wall_stops_thin_cells_before_the_guard_must():
+    config = VertexOptimizerConfig(barrier=0.0)
+    optimizer, reports = flattening(config)
+    assert sum(report.refused + report.halved for report in reports) == 0
+    assert config.limits.quality < optimizer.mesh.quality().min() < 2.5 * config.limits.quality
+    _, reports = flattening(VertexOptimizerConfig(barrier=0.0, wall=0.0))
+    assert sum(report.refused for report in reports) > 50
 
 
 def test_gradients_add_up_between_steps():
@@ -183,7 +201,7 @@ def test_gradients_add_up_between_steps():
 def test_descends_in_a_loop_of_ones_own():
     """Moves the inner vertices towards places that a valid mesh can reach."""
     mesh, target = TetMesh.grid((3, 3, 2), dtype=torch.float64), jittered_grid(5).vertices
-    optimizer = VertexOptimizer(mesh, VertexOptimizerConfig(barrier=0.0))
+    optimizer = VertexOptimizer(mesh, VertexOptimizerConfig(barrier=0.0, wall=0.0))
     for i in range(150):
         (optimizer.mesh.vertices - target).square().sum().backward()
         optimizer.step(optimizer.config.rate_at(i / 150))
@@ -270,6 +288,7 @@ def test_says_what_is_missing():
         {"final_rate": np.inf},
         {"betas": (0.9, 1.0)},
         {"barrier": -1.0},
+        {"wall": np.nan},
         {"cap": 0.25},
         {"coplanarity": -1e-3},
         {"boundary": "free"},

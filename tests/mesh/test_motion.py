@@ -206,6 +206,15 @@ def test_zero_moves_stay_zero():
     assert not move.any() and count == 1
 
 
+def test_the_barrier_can_weigh_cells_by_their_quality():
+    """With weight Q, the gradient of -Q log Q' at Q' = Q is that of -Q."""
+    mesh = random_mesh(4, torch.float64)
+    vertices = mesh.vertices.clone().requires_grad_()
+    (-mesh.with_vertices(vertices).quality().sum()).backward()
+    gradient = measure_vertices(mesh, lambda quality: quality).barrier_gradient
+    torch.testing.assert_close(gradient, vertices.grad)
+
+
 @properties
 @given(seed=seeds)
 def test_measures_are_those_of_the_differentiable_twin(seed):

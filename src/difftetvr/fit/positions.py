@@ -15,6 +15,11 @@ from difftetvr.mesh.motion import MotionLimits, cap_move, guard_move
 from difftetvr.mesh.shapes import VertexShapes, measure_vertices
 from difftetvr.mesh.tetmesh import TetMesh
 
+_WALL_START = 2.5
+"""Where the wall begins, in units of the guard's floor of Q."""
+_WALL_STEEPNESS = 100.0
+"""Bounds the wall: its weight is this where a cell lies at the floor or under it; the cap takes care of the rest."""
+
 _CONSTRAINT = ("vertices", "tangents", "anchors")
 
 
@@ -31,8 +36,11 @@ class VertexOptimizerConfig:
     """Length of the last steps; in between it falls log-linearly."""
     betas: tuple[float, float] = (0.9, 0.99)
     """Decay of the first and second moments of the gradient."""
-    barrier: float = 0.1
+    barrier: float = 0.03
     """Weight of the shape barrier, the sum of -log Q over all cells, in units of the rate; 0: none."""
+    wall: float = 0.1
+    """Weight of the same for cells close to the guard's floor, where it grows steeply; 0: none. With it, the
+    guard hardly ever has to refuse a move, and the barrier need not spoil cells that do well to be thin."""
     cap: float = 0.15
     """Longest step in altitudes, below 0.25: then no step can invert a cell even without the guard."""
     boundary: Literal["fixed", "slide"] = "fixed"
@@ -47,7 +55,9 @@ class VertexOptimizerConfig:
             value = getattr(self, name)
             _require(value > 0 and math.isfinite(value), name, value, "greater than 0 and finite")
         _require(all(0 <= beta < 1 for beta in self.betas), "betas", self.betas, "at least 0 and below 1")
-        _require(self.barrier >= 0 and math.isfinite(self.barrier), "barrier", self.barrier, "at least 0 and finite")
+        for name in ("barrier", "wall"):
+            value = getattr(self, name)
+            _require(value >= 0 and math.isfinite(value), name, value, "at least 0 and finite")
         _require(0 < self.cap < 0.25, "cap", self.cap, "between 0 and 0.25")
         _require(0 <= self.coplanarity < 1, "coplanarity", self.coplanarity, "at least 0 and below 1")
         _require(self.boundary in ("fixed", "slide"), "boundary", self.boundary, "fixed or slide")
@@ -83,7 +93,8 @@ class VertexOptimizer:
 
     A step goes against the mean gradient, in units of the altitude h of each vertex, plus a shape barrier:
 
-        move = -rate * h * m / sqrt(v) - rate * barrier * h^2 * gradient of the sum of -log Q
+        move = -rate * h * m / sqrt(v) - rate * h^2 * gradient of the sum of -w log Q,   w fixed
+        w = barrier + wall * max(2.5 floor - Q, 0) / (Q - floor),   floor = the least Q that the guard allows
 
     with m and v the first and second moments of h * gradient, v one number for each vertex: that of the vector's
     squared length. So the step does not depend on the unit of length, of the loss or on the axes. It is then
@@ -133,7 +144,7 @@ class VertexOptimizer:
         rate = self.config.rate if rate is None else rate
         gradient = self._finite_gradient()
         old = self.mesh.vertices.detach()
-        shapes = measure_vertices(self.mesh)
+        shapes = measure_vertices(self.mesh, self._barrier_weight)
         move = self._proposal(gradient, shapes, rate)
         move, capped = cap_move(self._constraint.apply(old, move), shapes.altitudes, self.config.cap)
         guarded = guard_move(self.mesh, move, self.config.limits, shapes.cells)
@@ -218,10 +229,16 @@ class VertexOptimizer:
         length = (self._second / (1.0 - decay_of_squares**self.steps)).sqrt()[:, None]
         # Where no gradient has ever been, moments are exactly zero: no epsilon, which would have the loss's unit.
         move = torch.where(length > 0, -rate * altitudes * mean / length, 0.0)
-        if self.config.barrier:
-            pull = (rate * self.config.barrier) * altitudes.square() * shapes.barrier_gradient
-            move = move - torch.where(torch.isfinite(pull), pull, 0.0)
-        return move
+        pull = rate * altitudes.square() * shapes.barrier_gradient
+        return move - torch.where(torch.isfinite(pull), pull, 0.0)
+
+    def _barrier_weight(self, quality: torch.Tensor) -> torch.Tensor:
+        """Weight of -log Q of cells of some quality."""
+        floor = self.config.limits.quality
+        start = _WALL_START * floor
+        least = max((start - floor) / _WALL_STEEPNESS, torch.finfo(quality.dtype).tiny)
+        nearness = (start - quality).clamp_min_(0.0) / (quality - floor).clamp_min_(least)
+        return nearness.mul_(self.config.wall).add_(self.config.barrier)
 
 
 def _require(condition: bool, name: str, value: object, rule: str) -> None:

@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -47,7 +47,7 @@ class VertexShapes:
 
     Attributes:
         altitudes: (V,) float64, the smallest altitude of all cells around each vertex, 0 where no cell uses it.
-        barrier_gradient: (V, 3) float64, gradient of the sum of -log Q over all cells.
+        barrier_gradient: (V, 3) float64, gradient of the sum of -log Q over all cells, each with its weight.
         cells: Volumes and qualities.
     """
 
@@ -114,11 +114,12 @@ def measure_cells(
     return results[0], results[1]
 
 
-def measure_vertices(mesh: TetMesh) -> VertexShapes:
+def measure_vertices(mesh: TetMesh, weigh: Callable[[torch.Tensor], torch.Tensor] | None = None) -> VertexShapes:
     """Altitudes, gradient of the shape barrier, volumes and qualities of a mesh in one pass.
 
     Args:
         mesh: Mesh of positive cells.
+        weigh: Weight of each cell's -log Q as a function of Q, (N,) float64 to (N,); default: 1 for all.
 
     Returns:
         The measures. Where a cell is so thin that float64 finds no volume, the barrier's gradient is not finite and
@@ -133,7 +134,7 @@ def measure_vertices(mesh: TetMesh) -> VertexShapes:
     gradient = torch.zeros_like(axes)
     for part in chunks(topology.num_cells, axes.device, width=_TEMPORARIES):
         corners = [column.contiguous() for column in columns[:, part].unbind()]
-        shape = _shape(axes, columns[:, part])
+        shape = _shape(axes, columns[:, part], weigh)
         cells[0, part] = shape.determinant
         cells[1, part] = shape.quality
         for corner, forces in zip(corners, shape.gradients):
@@ -151,7 +152,7 @@ class _Shape(NamedTuple):
     gradients: tuple[Axes, Axes, Axes, Axes]
 
 
-def _shape(axes: torch.Tensor, columns: torch.Tensor) -> _Shape:
+def _shape(axes: torch.Tensor, columns: torch.Tensor, weigh: Callable[[torch.Tensor], torch.Tensor] | None) -> _Shape:
     """Everything about some cells; gradients are those of -log Q with respect to their four corners."""
     a, b, c = _edges(axes, columns)
     # Twice the area vectors of the faces opposite corners 1, 2 and 3, pointing inwards; all four add up to zero.
@@ -165,7 +166,9 @@ def _shape(axes: torch.Tensor, columns: torch.Tensor) -> _Shape:
     squares = _squared_edges(a, b, c, total)
 
     # -log Q = -log det + 3/2 log S; the gradient of det at corner k is its normal, that of S is 2 (4 x_k - sum of x).
-    by_normal, by_edge = determinant.reciprocal(), 3.0 / squares
+    quality = _quality(determinant, squares)
+    weight = torch.ones_like(quality) if weigh is None else weigh(quality)
+    by_normal, by_edge = weight / determinant, 3.0 * weight / squares
     pull = [by_edge * t for t in total]
     by_edge = 4.0 * by_edge
     second, third, fourth = (
@@ -174,7 +177,7 @@ def _shape(axes: torch.Tensor, columns: torch.Tensor) -> _Shape:
     )
     first = _axes(by_normal * n - p for n, p in zip(total_normal, pull))
     altitude = determinant / largest.sqrt()
-    return _Shape(determinant, _quality(determinant, squares), altitude, (first, second, third, fourth))
+    return _Shape(determinant, quality, altitude, (first, second, third, fourth))
 
 
 def _edges(axes: torch.Tensor, columns: torch.Tensor) -> tuple[Axes, Axes, Axes]:
