@@ -19,6 +19,7 @@ GROUND = {"errors", "files", "libllvm"}
 
 ALLOWED = {
     "backend": GROUND,
+    "terminal": GROUND,
     "mesh": GROUND,
     "optics": GROUND | {"backend"},
     "render": GROUND | {"backend", "mesh", "optics"},

@@ -126,7 +126,7 @@ def test_invalid_captures(changes: dict, message: str) -> None:
     ("changes", "message"),
     [
         ({"views": 0}, "views is 0"),
-        ({"width": 0}, "image size"),
+        ({"width": 0}, "width is 0 pixels"),
         ({"radius": -1.0}, "radius"),
         ({"fov_y": 4.0}, "fov_y"),
         ({"attenuation": 0.0}, "attenuation"),

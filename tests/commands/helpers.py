@@ -1,0 +1,29 @@
+"""What the tests of the commands share."""
+
+import importlib
+import re
+
+import difftetvr.cli as cli
+
+LOOP = importlib.import_module("difftetvr.fit.loop")  # difftetvr.fit is the function, too
+VIEWS = ["--views", "10", "--width", "24", "--height", "24"]
+FIT = ["--cells", "500", "--iterations", "4", "--device", "cpu"]
+
+
+def fails(capsys, *args):
+    """Asserts exit code 2 and one sentence on standard error; returns it."""
+    capsys.readouterr()
+    assert cli.main([str(a) for a in args]) == 2
+    error = capsys.readouterr().err
+    assert re.fullmatch(r"difftetvr: [^\n]+\.\n", error), error
+    assert "Traceback" not in error
+    return error
+
+
+def raising(error):
+    """A function that raises an error, whatever it is called with."""
+
+    def fail(*args, **kwargs):
+        raise error
+
+    return fail

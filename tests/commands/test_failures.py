@@ -1,0 +1,160 @@
+"""Commands that fail: full disks, short memory, damaged runs; what they say and what they leave."""
+
+import errno
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from commands.helpers import FIT, LOOP, VIEWS, fails, raising
+
+import difftetvr.cli as cli
+from difftetvr.fit.checkpoint import Checkpoint
+from difftetvr.fit.folder import RunFolder
+from difftetvr.fit.loop import Trainer
+from difftetvr.terminal import sentence_for
+
+
+def test_outputs_that_cannot_be_written_are_found_before_the_work(run, tmp_path, capsys, monkeypatch):
+    def work(*args, **kwargs):
+        pytest.fail("the work has begun")
+
+    monkeypatch.setattr(cli.CaptureOptions, "load", work)
+    monkeypatch.setattr("difftetvr.mesh.io.load", work)
+    missing, file = tmp_path / "missing", tmp_path / "file"
+    file.write_text("")
+    for arguments in (
+        ["eval", run / "model.vtu", "tooth", "-o", missing / "e.json"],
+        ["render", run / "model.vtu", "-o", missing / "a.png"],
+        ["export", run / "model.vtu", missing / "a.vtk"],
+        ["fit", "tooth", "-o", file / "run"],
+    ):
+        assert "Cannot write" in fails(capsys, *arguments)
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
+MEMORY_ERRORS = [
+    MemoryError(),
+    torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB"),
+    RuntimeError("[enforce fail at alloc_cpu.cpp:124] err == 0. DefaultCPUAllocator: can't allocate memory: you tried"),
+    RuntimeError("jit_malloc(): out of memory! Could not allocate 68719476736 bytes of device memory."),
+    RuntimeError("cuda_check(): API error 0002 (CUDA_ERROR_OUT_OF_MEMORY)"),
+    RuntimeError("std::bad_alloc"),
+    OSError(errno.ENOMEM, "Cannot allocate memory"),
+]
+
+
+@pytest.mark.parametrize("error", MEMORY_ERRORS, ids=lambda e: f"{type(e).__name__} {e}"[:40])
+def test_every_shortage_of_memory_is_the_same_sentence(run, capsys, monkeypatch, error):
+    monkeypatch.setattr("difftetvr.mesh.io.load_with_optional_field", raising(error))
+    assert "not enough memory; use fewer cells" in fails(capsys, "info", run / "model.vtu")
+
+
+def test_real_shortages_of_memory_are_recognised():
+    for shortage in (lambda: torch.empty(2**46), lambda: np.empty(2**46), lambda: bytes(2**60)):
+        with pytest.raises((RuntimeError, MemoryError)) as caught:
+            shortage()
+        assert sentence_for(caught.value) == "There is not enough memory; use fewer cells, or fewer or smaller views."
+
+
+def test_mistakes_of_the_program_are_not_hidden(run, monkeypatch):
+    monkeypatch.setattr("difftetvr.mesh.io.load_with_optional_field", raising(RuntimeError("a shape is wrong")))
+    with pytest.raises(RuntimeError, match="a shape is wrong"):
+        cli.main(["info", str(run / "model.vtu")])
+
+
+@pytest.mark.parametrize("error", [MemoryError(), OSError(errno.ENOSPC, "No space left on device")])
+@pytest.mark.parametrize("where", ["prepare", "step", "save"])
+@pytest.mark.parametrize("existing", [False, True])
+def test_a_failed_start_leaves_nothing(tmp_path, capsys, monkeypatch, error, where, existing):
+    """Neither a run that refuses the next attempt nor the folders made for it."""
+    target = {
+        "prepare": (LOOP, "build_grid"),
+        "step": (Trainer, "step"),
+        "save": (Checkpoint, "save"),
+    }[where]
+    folder = tmp_path / "new" / "out"
+    if existing:
+        folder.mkdir(parents=True)
+        (folder / "notes.txt").write_text("mine")
+    before = sorted(tmp_path.rglob("*"))
+    with monkeypatch.context() as patch:
+        patch.setattr(*target, raising(error))
+        fails(capsys, "fit", "tooth", "-o", folder, *VIEWS, *FIT)
+    assert sorted(tmp_path.rglob("*")) == before
+    assert cli.main(["fit", "tooth", "-o", str(folder), *VIEWS, *FIT]) == 0
+
+
+def test_a_failure_later_keeps_what_can_be_resumed(tmp_path, capsys, monkeypatch):
+    step = Trainer.step
+
+    def third_fails(trainer):
+        if trainer.iteration == 2:
+            raise MemoryError
+        step(trainer)
+
+    folder = tmp_path / "out"
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "step", third_fails)
+        fails(capsys, "fit", "tooth", "-o", folder, *VIEWS, *FIT)
+    assert {p.name for p in folder.iterdir()} == {"config.json", "checkpoint.safetensors"}
+    assert "already holds" in fails(capsys, "fit", "tooth", "-o", folder, *VIEWS, *FIT)
+    assert cli.main(["fit", "tooth", "-o", str(folder), "--resume"]) == 0
+
+
+def test_what_cannot_start_does_not_cost_the_run_that_was_to_be_replaced(run, tmp_path, capsys, monkeypatch):
+    folder = tmp_path / "out"
+    shutil.copytree(run, folder)
+    with monkeypatch.context() as patch:
+        patch.setattr(LOOP, "build_grid", raising(MemoryError()))
+        fails(capsys, "fit", "tooth", "-o", folder, *VIEWS, *FIT, "--overwrite")
+    assert {p.name: p.read_bytes() for p in folder.glob("*.*")} == {p.name: p.read_bytes() for p in run.glob("*.*")}
+
+
+def test_overwriting_removes_the_checkpoint_first_and_the_options_last(run, tmp_path, monkeypatch):
+    folder = tmp_path / "out"
+    shutil.copytree(run, folder)
+    removed = []
+    unlink = Path.unlink
+
+    def note(path, missing_ok=False):
+        removed.append(path.name)
+        unlink(path, missing_ok)
+
+    monkeypatch.setattr(Path, "unlink", note)
+    RunFolder(folder)._clear()
+    assert removed[0] == "checkpoint.safetensors"
+    assert removed[-1] == "config.json"
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"capture_options": {"views": "ten"}},
+        {"capture_options": {"views": 10, "colour": 3}},
+        {"capture_options": [10]},
+        {"capture": 3},
+        {"fit": {"cells": "many"}},
+        {"fit": {"cells": -5}},
+        {"fit": None},
+    ],
+)
+def test_damaged_options_of_a_run(run, tmp_path, capsys, change):
+    folder = tmp_path / "out"
+    shutil.copytree(run, folder)
+    saved = json.loads((run / "config.json").read_text())
+    (folder / "config.json").write_text(json.dumps(saved | change))
+    assert f"{folder}/config.json is damaged" in fails(capsys, "fit", "tooth", "-o", folder, "--resume")
+    for name in change:
+        (folder / "config.json").write_text(json.dumps({k: v for k, v in saved.items() if k != name}))
+        assert "lacks" in fails(capsys, "fit", "tooth", "-o", folder, "--resume")
+
+
+def test_folder_in_place_of_the_checkpoint(run, tmp_path, capsys):
+    folder = tmp_path / "out"
+    shutil.copytree(run, folder)
+    (folder / "checkpoint.safetensors").unlink()
+    (folder / "checkpoint.safetensors").mkdir()
+    assert "is a folder where the checkpoint" in fails(capsys, "fit", "tooth", "-o", folder, "--resume")
