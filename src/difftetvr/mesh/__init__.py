@@ -1,7 +1,26 @@
-"""What a tetrahedral mesh is: positions, cells, topology, quality, and the field on it."""
+"""What a tetrahedral mesh is: positions, cells, topology, quality, the field on it, and how its cells change."""
 
+from difftetvr.mesh.bisection import bisect_edges, independent_edges, long_edges
+from difftetvr.mesh.change import MeshChange
+from difftetvr.mesh.collapse import collapse_edges
 from difftetvr.mesh.field import Field
+from difftetvr.mesh.insertion import DelaunayInsertion, insert_delaunay
+from difftetvr.mesh.removal import remove_cells
+from difftetvr.mesh.star import star_subdivision
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.mesh.topology import Topology
 
-__all__ = ["Field", "TetMesh", "Topology"]
+__all__ = [
+    "DelaunayInsertion",
+    "Field",
+    "MeshChange",
+    "TetMesh",
+    "Topology",
+    "bisect_edges",
+    "collapse_edges",
+    "independent_edges",
+    "insert_delaunay",
+    "long_edges",
+    "remove_cells",
+    "star_subdivision",
+]
