@@ -145,9 +145,7 @@ def main() -> None:
         "NODES": rounded(nodes),
         "WEIGHTS": rounded(weights),
     }
-    print(
-        '"""Constants of the float32 optics, from scripts/fit_optics_coefficients.py; not to be edited by hand."""'
-    )
+    print('"""Constants of the float32 optics, from scripts/fit_optics_coefficients.py; not to be edited by hand."""')
     print(f"\nTHIN = {THIN}\nVISIBLE = {VISIBLE}")
     for name, value in tables.items():
         print(f"{name} = {value}")
