@@ -133,7 +133,7 @@ class Camera:
     def to_camera_space(self, points: torch.Tensor) -> torch.Tensor:
         """(N, 3) world-space points in camera space; differentiable in the points and the extrinsics."""
         pose = self.world_to_camera.to(points)
-        return points @ pose[:3, :3].T + pose[:3, 3]
+        return torch.addmm(pose[:3, 3], points, pose[:3, :3].T)
 
     def ray_directions(self) -> torch.Tensor:
         """(H, W, 3) unit directions of the pixels' rays in camera space, float64."""

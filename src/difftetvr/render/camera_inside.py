@@ -22,7 +22,7 @@ def cells_around_camera(backend: Backend, mesh: TetMesh, camera_vertices: torch.
     """Cells that may hold the camera: it lies in them or very near; None if there are none."""
     positions = camera_vertices.detach()
     # One axis after the other: most cameras look at the mesh from outside, and z says so.
-    if any(bool((positions[:, axis].amin() > 0) | (positions[:, axis].amax() < 0)) for axis in (2, 0, 1)):
+    if any(positions[:, axis].amin() > 0 or positions[:, axis].amax() < 0 for axis in (2, 0, 1)):
         return None
     vertices, tets = backend.floats(positions), backend.uints(mesh.tets)
     cell = dr.arange(backend.UInt, mesh.num_cells)
