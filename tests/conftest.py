@@ -1,6 +1,7 @@
-"""What all tests share: the `gpu` marker and the folder of example data."""
+"""What all tests share: the `gpu` marker, one thread for torch, and the folder of example data."""
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -20,6 +21,17 @@ def _cuda_works() -> bool:
     import torch
 
     return torch.cuda.is_available() and drjit.has_backend(drjit.JitBackend.CUDA)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_torch_thread() -> Iterator[None]:
+    """Run torch on one thread: small tensors gain nothing from more, which only get in the way of the kernels'."""
+    import torch
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="session")

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from capture.damage import damaged_copies
 
 from difftetvr.capture import Volume
 from difftetvr.errors import CaptureError
@@ -204,14 +205,9 @@ def test_damaged_files_load_or_give_a_capture_error(tmp_path: Path, kind: str) -
         write_vti(path, SHORTS, kind[4:], "zlib")
     else:
         path.write_bytes(lzma.compress(SHORTS.tobytes()))
-    original, random, failures = path.read_bytes(), np.random.default_rng(5), 0
-    for trial in range(150):
-        data = bytearray(original)
-        if trial % 3 == 0:
-            data = data[: random.integers(0, len(data))]
-        for position in random.integers(0, max(len(data), 1), 1 + trial % 3) if data else ():
-            data[position] = random.integers(0, 256)
-        path.write_bytes(bytes(data))
+    failures = 0
+    for data in damaged_copies(path.read_bytes(), seed=5):
+        path.write_bytes(data)
         try:
             Volume.load(path)
         except CaptureError as error:

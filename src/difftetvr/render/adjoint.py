@@ -258,8 +258,7 @@ def _slope(face: Face, crossing: list[Any]) -> tuple[Any, Any]:
     is where the hit point's own motion enters: with this slope H a corner gets w_k (-H_a, -H_b, g_t).
     """
     a, b, c = face.corners
-    total = face.edges[0] + face.edges[1] + face.edges[2]
-    inverse = dr.select(total > 0, 1.0 / total, 0.0)
+    inverse = face.inverse_area()
     # Differences of values, since the distances of a far mesh would cancel.
     change = []
     for corner in (b, c):

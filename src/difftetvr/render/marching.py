@@ -145,13 +145,13 @@ def walk(
         apex = dr.gather(uint, scene.entries.apices, row, active)
         vertices = [dr.gather(uint, scene.entries.corners, 3 * row + k, active) for k in range(3)]
         face = make_face([read(vertex, active) for vertex in vertices])
-        entry = interpolate(face, face.weights())
+        entry = interpolate(face)
 
         def advance(active: Any, cell: Any, apex: Any, face: Face, entry: list[Any], ray: Any) -> tuple[Any, ...]:
             corner = read(apex, active)
             way_out = find_exit(face, corner)
             next_face = way_out.face(face, corner)
-            leaving = interpolate(next_face, next_face.weights())
+            leaving = interpolate(next_face)
             ray = visit(Step(cell, face, corner, way_out, next_face, entry, leaving), ray)
             link = table_row(cell, way_out.vertex(face), face, corner)
             behind = dr.gather(scene.backend.UInt2, scene.table, link, active)

@@ -45,15 +45,20 @@ class Face:
     corners: list[Corner]
     edges: list[Any]  # edge k is opposite corner k: (k + 1) -> (k + 2)
 
+    def inverse_area(self) -> Any:
+        """One over twice the signed area of the face in the ray's plane, 0 where there is none."""
+        total = self.edges[0] + self.edges[1] + self.edges[2]
+        return dr.select(total != 0, 1.0 / total, 0.0)
+
     def weights(self) -> list[Any]:
         """Barycentric weights of the ray's crossing; the edges share one sign, so nothing cancels."""
-        total = self.edges[0] + self.edges[1] + self.edges[2]
-        inverse = dr.select(total != 0, 1.0 / total, 0.0)
+        inverse = self.inverse_area()
         return [edge * inverse for edge in self.edges]
 
 
-def interpolate(face: Face, weights: list[Any]) -> list[Any]:
+def interpolate(face: Face) -> list[Any]:
     """Values of the face's corners at the ray's crossing."""
+    weights = face.weights()
     return [
         dr.fma(weights[0], v0, dr.fma(weights[1], v1, weights[2] * v2))
         for v0, v1, v2 in zip(*(corner.values for corner in face.corners), strict=True)
@@ -92,7 +97,7 @@ def crossing_depth(face: Face) -> Any:
         second = tuple(dr.select(swap, x, y) for x, y in zip(corners[i], corners[j], strict=True))
         corners[i], corners[j] = first, second
     ordered = make_face([Corner(vertex, a, b, [t], []) for vertex, a, b, t in corners])
-    return interpolate(ordered, ordered.weights())[0]
+    return interpolate(ordered)[0]
 
 
 @dataclass
