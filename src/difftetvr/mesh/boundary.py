@@ -6,9 +6,14 @@ from dataclasses import dataclass
 
 import torch
 
+from difftetvr.mesh import quality
 from difftetvr.mesh.arrays import true_indices
-from difftetvr.mesh.incidence import boundary_vertices
+from difftetvr.mesh.incidence import boundary_vertices, stars
+from difftetvr.mesh.shapes import length_scale
 from difftetvr.mesh.tetmesh import TetMesh
+from difftetvr.mesh.topology import Topology
+
+_PAIRS_AT_ONCE = 2**16
 
 
 @dataclass(frozen=True)
@@ -74,6 +79,67 @@ class BoundaryConstraint:
         # The part of `off_anchor` that is not tangential is what rounding has moved the vertex off its plane.
         kept = (self.tangents @ (on_boundary - off_anchor)[:, :, None])[:, :, 0] + off_anchor
         return move.index_copy(0, self.vertices, kept)
+
+
+def keeps_surface(mesh: TetMesh, half_edges: torch.Tensor, tolerance: float = 1e-4) -> torch.Tensor:
+    """Whether the boundary stays the same surface where one of its vertices v is merged into its neighbour u.
+
+    It does if no cell gets inverted, which is not looked at here, and
+    - v may slide towards u in the sense of `BoundaryConstraint.sliding`;
+    - the boundary faces that v takes along sweep no volume, compared with the cells around v: where cells are thin, a
+      direction in which v may slide can still lead through them;
+    - the area of the boundary faces around v stays: it grows where one turns over, as only cells that are flat up to
+      rounding allow, and changes where v is a corner of a slit without width.
+
+    Args:
+        mesh: Any valid mesh.
+        half_edges: (N, 2) vertices [v, u] on the boundary that share an edge.
+        tolerance: Largest sine of an angle between directions and planes that are taken for parallel, and the largest
+            share of volumes and areas that is taken for rounding.
+
+    Returns:
+        (N,) bool.
+    """
+    constraint = BoundaryConstraint.sliding(mesh, tolerance)
+    positions = mesh.vertices.detach().double() * length_scale(mesh.vertices)
+    half_edges = half_edges.long().t().contiguous()
+    removed, kept = half_edges
+    local = torch.searchsorted(constraint.vertices, removed)
+    direction = positions[kept] - positions[removed]
+    off = direction - (constraint.tangents[local] @ direction[:, :, None])[:, :, 0]
+    keeps = torch.linalg.vector_norm(off, dim=1) <= tolerance * torch.linalg.vector_norm(direction, dim=1)
+
+    owner, cells = stars(mesh.topology, constraint.vertices)
+    volumes = quality.volumes(positions, mesh.tets[cells])
+    volume = volumes.new_zeros(constraint.vertices.shape[0]).index_add_(0, owner, volumes)[local]
+    # As cells with a vertex outside, boundary faces have tables of who is around a vertex.
+    faces = mesh.topology.boundary_faces
+    shell = Topology(torch.nn.functional.pad(faces, (0, 1), value=mesh.num_vertices), mesh.num_vertices + 1)
+    for rows in true_indices(keeps).split(_PAIRS_AT_ONCE):
+        keeps[rows] = _keep_in_place(positions, shell, half_edges[:, rows], volume[rows], tolerance)
+    return keeps
+
+
+def _keep_in_place(
+    positions: torch.Tensor, shell: Topology, half_edges: torch.Tensor, volume: torch.Tensor, tolerance: float
+) -> torch.Tensor:
+    """(N,) bool: boundary faces around v keep their area and sweep no volume; half_edges is (2, N) here."""
+    removed, kept = half_edges
+    owner, rows = stars(shell, removed)
+    faces = shell.tets[rows, :3].long()
+    moved = torch.where(faces == removed[owner, None], kept[owner, None], faces)
+    before, after = _area_vectors(positions[faces]), _area_vectors(positions[moved])
+    swept = ((positions[kept] - positions[removed])[owner] * before).sum(1).abs() / 6.0
+    lengths = [torch.linalg.vector_norm(vectors, dim=1) for vectors in (before, after)]
+    sums = positions.new_zeros((removed.shape[0], 3))
+    sums.index_add_(0, owner, torch.stack((*lengths, swept), 1))
+    area, area_after, swept = sums.unbind(1)
+    return ((area_after - area).abs() <= tolerance * area) & (swept <= tolerance * volume)
+
+
+def _area_vectors(triangles: torch.Tensor) -> torch.Tensor:
+    """Normals of (N, 3, 3) triangles, (N, 3), as long as twice the area."""
+    return torch.linalg.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
 
 
 def _normal_squares(triangles: torch.Tensor) -> torch.Tensor:

@@ -1,12 +1,15 @@
-"""Half-edge collapse: an interior vertex is merged into a neighbour, and the cells around their edge vanish."""
+"""Half-edge collapse: a vertex is merged into a neighbour, and the cells around their edge vanish."""
 
 from __future__ import annotations
+
+from typing import Literal
 
 import torch
 
 from difftetvr.errors import MeshError
 from difftetvr.mesh import quality
 from difftetvr.mesh.arrays import chunks, true_indices
+from difftetvr.mesh.boundary import keeps_surface
 from difftetvr.mesh.change import MeshChange, check_indices, with_vertices_kept
 from difftetvr.mesh.incidence import boundary_vertices, stars
 from difftetvr.mesh.independent import best_first
@@ -30,16 +33,22 @@ def collapse_edges(
     *,
     limit: int | None = None,
     min_quality: float = 0.1,
+    boundary: Literal["fixed", "slide"] = "fixed",
+    coplanarity: float = 1e-4,
 ) -> MeshChange:
     """Merge vertices into neighbours, cheapest first, where the mesh stays valid and its shapes stay good.
 
     Vertex v may be merged into its neighbour u if
-    - v is not on the boundary (u may be), so the boundary stays as it is;
+    - v is not on the boundary (u may be), or with boundary="slide" both are and the boundary stays the same surface: v
+      lies in a plane of it, or on a straight crease of planes and u further along the crease; corners stay;
     - the link condition Lk(u) ∩ Lk(v) = Lk(uv) holds, so the result is the same manifold;
     - all cells around v that remain have positive volume, and quality of at least `min_quality`; where the worst cell
       around v is worse than that already, none may become worse than it.
-    Collapses that are done together have no cell around their removed vertices in common, so each is as valid as it
-    would be alone. The choice is that of doing them one by one in the order of cost; ties are broken in a fixed order.
+    The remaining cells around v then fill the same space as before, without overlap: what bounds them together is the
+    same, but for faces that move within their own planes (see `keeps_surface`), and none of them is inverted.
+    Collapses that are done together have no cell around their removed vertices in common, nor a boundary face that they
+    make, so each is as valid as it would be alone. The choice is that of doing them one by one in the order of cost;
+    ties are broken in a fixed order.
 
     Args:
         mesh: The mesh.
@@ -48,13 +57,16 @@ def collapse_edges(
         cost: (C,) real numbers, lowest first.
         limit: How many cells may vanish in all; choosing ends before the first collapse that would exceed it.
         min_quality: Smallest quality of a changed cell (see `difftetvr.mesh.quality`).
+        boundary: Whether vertices on the boundary stay, or go where its shape does not need them.
+        coplanarity: Largest sine of the angle between boundary faces that count as one plane, in [0, 1); positions are
+            rounded, so in general 0 lets none slide.
 
     Returns:
         The change. Vertices and cells that remain keep their order, and vertices their place among a cell's corners; a
         changed cell's parent is the one it was before v moved to u. Vertices that no cell uses stay.
 
     Raises:
-        MeshError: An index is out of range, cost is NaN, or lengths do not match.
+        MeshError: An index is out of range, cost is NaN, lengths do not match, or an option is none of the above.
     """
     if edges.ndim != 1 or target.shape != edges.shape or cost.shape != edges.shape:
         shapes = ", ".join(str(tuple(tensor.shape)) for tensor in (edges, target, cost))
@@ -64,9 +76,24 @@ def collapse_edges(
     ends = mesh.topology.edges[check_indices(edges, mesh.topology.edges.shape[0], "edge")]
     kept = ends.gather(1, check_indices(target, 2, "target")[:, None])
     half_edges = torch.cat((ends.sum(1, keepdim=True, dtype=ends.dtype) - kept, kept), 1)
-    inner = true_indices(~boundary_vertices(mesh.topology)[half_edges[:, 0].long()])
-    queue = half_edges[inner[best_first(-cost.detach()[inner])]]
-    return _apply(mesh, _choose(mesh, queue, limit, min_quality))
+    movable = true_indices(_movable(mesh, half_edges, boundary, coplanarity))
+    queue = half_edges[movable[best_first(-cost.detach()[movable])]]
+    return _apply(mesh, _without_twins(mesh, _choose(mesh, queue, limit, min_quality)))
+
+
+def _movable(mesh: TetMesh, half_edges: torch.Tensor, boundary: str, coplanarity: float) -> torch.Tensor:
+    """(C,) bool: which collapses [v, u] leave the boundary as it is, whatever they do to cells."""
+    if boundary not in ("fixed", "slide") or not 0 <= coplanarity < 1:
+        raise MeshError(
+            f"The boundary is {boundary!r} with a coplanarity of {coplanarity}; pass 'fixed' or 'slide' and a number "
+            "of at least 0 and below 1."
+        )
+    outer = boundary_vertices(mesh.topology)
+    movable = ~outer[half_edges[:, 0].long()]
+    if boundary == "slide":
+        sliding = true_indices(~movable & outer[half_edges[:, 1].long()])
+        movable[sliding] = keeps_surface(mesh, half_edges[sliding], coplanarity)
+    return movable
 
 
 def _choose(mesh: TetMesh, queue: torch.Tensor, limit: int | None, min_quality: float) -> torch.Tensor:
@@ -165,10 +192,37 @@ def _worst(values: torch.Tensor, owner: torch.Tensor, count: int) -> torch.Tenso
     return largest.scatter_reduce_(0, owner, values, "amin")
 
 
-def _apply(mesh: TetMesh, half_edges: torch.Tensor) -> MeshChange:
+def _without_twins(mesh: TetMesh, half_edges: torch.Tensor) -> torch.Tensor:
+    """Leave out each collapse that makes a boundary face which one before it makes as well.
+
+    It happens on the two sides of a slit without width, where the two faces would be paired as one inner face.
+    """
+    count = half_edges.shape[0]
+    rank = half_edges.new_full((mesh.num_vertices,), count, dtype=torch.int64)
+    rank[half_edges[:, 0].long()] = torch.arange(count, device=rank.device)
+    faces = mesh.topology.boundary_faces.long()
+    # Removed vertices are no neighbours, so a face has one of them at most.
+    maker = rank[faces].amin(1)
+    made = true_indices(maker < count)
+    corners = _moved_to(mesh, half_edges)[faces[made]].sort(1).values
+    remains = (corners.diff(dim=1) > 0).all(1)
+    maker = maker[made[remains]]
+    _, twin = torch.unique(corners[remains], dim=0, return_inverse=True)
+    first = torch.full_like(maker, count).scatter_reduce_(0, twin, maker, "amin")
+    stays = torch.ones(count, dtype=torch.bool, device=rank.device)
+    stays[maker[maker > first[twin]]] = False
+    return half_edges[stays]
+
+
+def _moved_to(mesh: TetMesh, half_edges: torch.Tensor) -> torch.Tensor:
+    """(V,) int32: the vertex that each vertex becomes."""
     moved_to = torch.arange(mesh.num_vertices, dtype=torch.int32, device=half_edges.device)
-    removed = half_edges[:, 0].long()
-    moved_to[removed] = half_edges[:, 1]
+    moved_to[half_edges[:, 0].long()] = half_edges[:, 1]
+    return moved_to
+
+
+def _apply(mesh: TetMesh, half_edges: torch.Tensor) -> MeshChange:
+    moved_to, removed = _moved_to(mesh, half_edges), half_edges[:, 0].long()
     is_kept = torch.ones(mesh.num_vertices, dtype=torch.bool, device=half_edges.device)
     is_kept[removed] = False
     kept = true_indices(is_kept)
