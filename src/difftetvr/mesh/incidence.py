@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from difftetvr.errors import MeshError
-from difftetvr.mesh.arrays import chunks, put, sort_keys
+from difftetvr.mesh.arrays import chunks, put, sort_keys, true_indices
 from difftetvr.mesh.topology import LOCAL_EDGES, Topology
 
 _KEY_BITS = 63
@@ -21,6 +21,18 @@ def cell_edges(topology: Topology) -> torch.Tensor:
         (T, 6) int32 indices into `topology.edges`, in the order of `LOCAL_EDGES`.
     """
     return topology.cached("incidence.cell_edges", lambda: _build_cell_edges(topology))
+
+
+def cell_faces(topology: Topology) -> torch.Tensor:
+    """The four faces of each cell; built once and kept with the topology.
+
+    Args:
+        topology: The cells.
+
+    Returns:
+        (T, 4) int32 indices into `topology.faces`, of the face opposite local vertex k.
+    """
+    return topology.cached("incidence.cell_faces", lambda: _build_cell_faces(topology))
 
 
 def find_edges(topology: Topology, ends: torch.Tensor) -> torch.Tensor:
@@ -97,6 +109,20 @@ def stars(topology: Topology, vertices: torch.Tensor) -> tuple[torch.Tensor, tor
 
 def _edge_keys(ends: torch.Tensor) -> torch.Tensor:
     return (ends[:, 0] << 32) | ends[:, 1]
+
+
+def _build_cell_faces(topology: Topology) -> torch.Tensor:
+    table = torch.empty((topology.num_cells, 4), dtype=torch.int32, device=topology.tets.device)
+    for column in (0, 1):
+        cells = topology.face_cells[:, column].long()
+        faces = true_indices(cells >= 0)
+        for part in chunks(faces.shape[0], faces.device, width=12):
+            face, cell = faces[part], cells[faces[part]]
+            corners = topology.tets[cell]
+            # The one corner that the face lacks.
+            apex = corners.sum(1, keepdim=True, dtype=torch.int64) - topology.faces[face].sum(1, keepdim=True)
+            put(table.view(-1), 4 * cell + (corners == apex).int().argmax(1), face.int())
+    return table
 
 
 def _build_cell_edges(topology: Topology) -> torch.Tensor:

@@ -9,7 +9,7 @@ from difftetvr.mesh.arrays import chunks, true_indices
 from difftetvr.mesh.change import MeshChange, check_indices, with_midpoints
 from difftetvr.mesh.incidence import cell_edges
 from difftetvr.mesh.tetmesh import TetMesh
-from difftetvr.mesh.topology import LOCAL_EDGES
+from difftetvr.mesh.topology import LOCAL_EDGE_OF, LOCAL_EDGES
 from difftetvr.mesh.validation import orientations
 
 # Points of a cell: its corners 0 to 3 in the order of `_canonical`, then the midpoints of `LOCAL_EDGES`, 4 to 9. All
@@ -38,10 +38,6 @@ _MORE_DIAGONALS = ((4, 9), (5, 8), (6, 7))
 
 _CELLS_AFTER = (1, 4, 7, 8, 8)
 """Number of cells that a cell with so many chosen corners becomes."""
-
-_LOCAL_EDGE_OF = tuple(
-    tuple(LOCAL_EDGES.index((min(i, j), max(i, j))) if i != j else -1 for j in range(4)) for i in range(4)
-)
 
 
 def star_subdivision(mesh: TetMesh, vertices: torch.Tensor) -> MeshChange:
@@ -125,7 +121,7 @@ def _canonical(
     keys = (~is_chosen[corners]).long() * mesh.num_vertices + corners
     order = keys.sort(1).indices
     inversions = sum((order[:, i] > order[:, j]).int() for i, j in LOCAL_EDGES)
-    local_edges = torch.tensor(_LOCAL_EDGE_OF, device=cells.device)
+    local_edges = torch.tensor(LOCAL_EDGE_OF, device=cells.device)
     columns = torch.stack([local_edges[order[:, i], order[:, j]] for i, j in LOCAL_EDGES], 1)
     middles = midpoint[cell_edges(mesh.topology)[cells].gather(1, columns).long()]
     return torch.cat((corners.gather(1, order).int(), middles), 1), torch.as_tensor(inversions) % 2 == 1

@@ -10,10 +10,15 @@ import torch
 from difftetvr.mesh.arrays import chunks, sort_keys, true_indices
 from difftetvr.mesh.faces import LOCAL_FACES, check_matching, face_vertices, match_faces
 
-__all__ = ["LOCAL_EDGES", "LOCAL_FACES", "Topology"]
+__all__ = ["LOCAL_EDGES", "LOCAL_EDGE_OF", "LOCAL_FACES", "Topology"]
 
 LOCAL_EDGES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
 """Local vertices of a cell's six edges."""
+
+LOCAL_EDGE_OF = tuple(
+    tuple(LOCAL_EDGES.index((min(i, j), max(i, j))) if i != j else -1 for j in range(4)) for i in range(4)
+)
+"""Which of the six edges joins two local vertices; -1 on the diagonal."""
 
 _ROW_BITS = 32
 _ROW_MASK = (1 << _ROW_BITS) - 1

@@ -85,7 +85,7 @@ class PixelAdjoint:
     distance: Any | None
 
 
-def _buffer_length(count: int) -> int:
+def buffer_length(count: int) -> int:
     """A length of at least ``count`` out of few, four an octave: per-thread copies bake it into the kernel."""
     step = 1 << max(0, count.bit_length() - 3)
     return -(-count // step) * step
@@ -109,8 +109,8 @@ def render_adjoint(scene: MarchingScene, image: ImageAdjoint, vertex_count: int,
         with_vertices: Whether positions need gradients; the kernel is cheaper without.
     """
     real = scene.backend.Float
-    field_count = _buffer_length(vertex_count if scene.cells is None else dr.width(scene.cells) // 4)
-    position_count = _buffer_length(vertex_count) if with_vertices else 0
+    field_count = buffer_length(vertex_count if scene.cells is None else dr.width(scene.cells) // 4)
+    position_count = buffer_length(vertex_count) if with_vertices else 0
     gradients = Gradients(
         dr.zeros(real, 4 * field_count),
         dr.zeros(real, 4 * position_count) if with_vertices else None,

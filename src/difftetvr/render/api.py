@@ -73,6 +73,40 @@ def render(
     """
     if renderer not in RENDERERS:
         raise DiffTetError(f"There is no renderer '{renderer}'; choose one of {', '.join(RENDERERS)}.")
+    view = prepare_view(mesh, field, camera, optics, transmittance_threshold, deterministic)
+    behind = as_background(background, mesh.vertices)
+    light, distance = MarchingFunction.apply(view.task, view.vertices, view.color, view.density)
+    return compose(light, _times(distance, view.unit), behind)
+
+
+@dataclass(frozen=True)
+class PreparedView:
+    """A view as kernels take it.
+
+    Attributes:
+        task: What it needs besides tensors that may require gradients.
+        vertices: (V, 3) in camera space, in a unit in which products neither vanish nor overflow.
+        color: (N, 3) linear RGB.
+        density: (N,) in that unit.
+        unit: The unit, in world units.
+    """
+
+    task: MarchingTask
+    vertices: torch.Tensor
+    color: torch.Tensor
+    density: torch.Tensor
+    unit: float
+
+
+def prepare_view(
+    mesh: TetMesh,
+    field: Field,
+    camera: Camera,
+    optics: OpticalModel | None,
+    transmittance_threshold: float,
+    deterministic: bool,
+) -> PreparedView:
+    """Check a view's inputs and bring them into camera space; arguments and errors are those of :func:`render`."""
     if not 0.0 <= transmittance_threshold < 1.0:
         raise DiffTetError(f"transmittance_threshold is {transmittance_threshold}; it must lie in [0, 1).")
     per_cell = field.location_on(mesh) == "cell"
@@ -84,16 +118,21 @@ def render(
     backend = backend_for(mesh.vertices)
     field = field.to(dtype=backend.dtype)
     field.validate(mesh)
-    behind = None if background is None else _background(background, mesh.vertices)
     if optics is None:
         optics = ConstantPerCell() if per_cell else ExactLinear()
     task = MarchingTask(backend, mesh, camera, optics, per_cell, transmittance_threshold, deterministic)
     vertices, unit = _unit_of_length(camera.to_camera_space(mesh.vertices), mesh)
-    light, distance = MarchingFunction.apply(task, vertices, field.color, _times(field.density, unit))
-    return _compose(light, _times(distance, unit), behind)
+    return PreparedView(task, vertices, field.color, _times(field.density, unit), unit)
 
 
-def _background(background: Any, like: torch.Tensor) -> torch.Tensor:
+def as_background(background: Any, like: torch.Tensor) -> torch.Tensor | None:
+    """(3,) linear RGB in the precision and on the device of a tensor; None stays None.
+
+    Raises:
+        DiffTetError: These are not three finite numbers.
+    """
+    if background is None:
+        return None
     try:
         behind = torch.as_tensor(background, dtype=like.dtype, device=like.device)
     except (TypeError, ValueError, RuntimeError) as error:
@@ -124,7 +163,14 @@ def _times(values: torch.Tensor, unit: float) -> torch.Tensor:
     return values if unit == 1.0 else values * unit
 
 
-def _compose(light: torch.Tensor, distance: torch.Tensor, behind: torch.Tensor | None) -> RenderedImage:
+def compose(light: torch.Tensor, distance: torch.Tensor, behind: torch.Tensor | None) -> RenderedImage:
+    """The image that a kernel's output stands for.
+
+    Args:
+        light: (H, W, 4) premultiplied radiance and optical depth.
+        distance: (H, W) integral of the distance in world units.
+        behind: (3,) linear RGB behind the volume; black if None.
+    """
     color, optical_depth = light[..., :3], light[..., 3]
     if behind is not None:
         color = color + torch.exp(-optical_depth)[..., None] * behind
