@@ -6,6 +6,7 @@ import re
 import difftetvr.cli as cli
 
 LOOP = importlib.import_module("difftetvr.fit.loop")  # difftetvr.fit is the function, too
+TRAINER = importlib.import_module("difftetvr.fit.trainer")
 VIEWS = ["--views", "10", "--width", "24", "--height", "24"]
 FIT = ["--cells", "500", "--iterations", "4", "--device", "cpu"]
 

@@ -26,6 +26,7 @@ def test_fit_fills_its_folder(run):
         "config.json",
         "curves.png",
         "comparison.png",
+        "cut.png",
         "views",
         "checkpoint.safetensors",
     }

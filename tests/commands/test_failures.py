@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from commands.helpers import FIT, LOOP, VIEWS, fails, raising
+from commands.helpers import FIT, TRAINER, VIEWS, fails, raising
 
 import difftetvr.cli as cli
 from difftetvr.fit.checkpoint import Checkpoint
 from difftetvr.fit.folder import RunFolder
-from difftetvr.fit.loop import Trainer
+from difftetvr.fit.trainer import Trainer
 from difftetvr.terminal import sentence_for
 
 
@@ -71,7 +71,7 @@ def test_mistakes_of_the_program_are_not_hidden(run, monkeypatch):
 def test_a_failed_start_leaves_nothing(tmp_path, capsys, monkeypatch, error, where, existing):
     """Neither a run that refuses the next attempt nor the folders made for it."""
     target = {
-        "prepare": (LOOP, "build_grid"),
+        "prepare": (TRAINER, "build_grid"),
         "step": (Trainer, "step"),
         "save": (Checkpoint, "save"),
     }[where]
@@ -108,7 +108,7 @@ def test_what_cannot_start_does_not_cost_the_run_that_was_to_be_replaced(run, tm
     folder = tmp_path / "out"
     shutil.copytree(run, folder)
     with monkeypatch.context() as patch:
-        patch.setattr(LOOP, "build_grid", raising(MemoryError()))
+        patch.setattr(TRAINER, "build_grid", raising(MemoryError()))
         fails(capsys, "fit", "tooth", "-o", folder, *VIEWS, *FIT, "--overwrite")
     assert {p.name: p.read_bytes() for p in folder.glob("*.*")} == {p.name: p.read_bytes() for p in run.glob("*.*")}
 

@@ -14,8 +14,8 @@ from difftetvr.errors import BackendError, CaptureError
 from difftetvr.fit import FitConfig, FitError, fit
 from difftetvr.fit.checkpoint import Checkpoint
 from difftetvr.fit.evaluation import evaluate, true_image
-from difftetvr.fit.loop import Trainer
 from difftetvr.fit.parameters import FieldParameters
+from difftetvr.fit.trainer import Trainer
 from difftetvr.mesh import TetMesh
 
 SMALL = FitConfig(cells=2_000, iterations=40, evaluate_every=20, device="cpu")
@@ -26,10 +26,13 @@ TINY = FitConfig(cells=500, iterations=3, device="cpu")
 def assert_same_result(a, b):
     """To the last bit, in all but the time it took."""
     assert torch.equal(a.mesh.vertices, b.mesh.vertices)
+    assert torch.equal(a.mesh.tets, b.mesh.tets)
     assert torch.equal(a.field.color, b.field.color)
     assert torch.equal(a.field.density, b.field.density)
     assert a.history.loss == b.history.loss
     assert a.history.evaluations == b.history.evaluations
+    assert a.history.refinements == b.history.refinements
+    assert a.history.moves == b.history.moves
     assert {**a.metrics, "seconds": 0} == {**b.metrics, "seconds": 0}
 
 
@@ -87,7 +90,7 @@ def test_killed_run_goes_on_from_its_last_checkpoint(small_capture, reference, t
         if progress.iteration == 22:
             path.rename(kept)
 
-    config = FitConfig(**{**SMALL.to_json(), "checkpoint_seconds": 0.0})
+    config = dataclasses.replace(SMALL, checkpoint_seconds=0.0)
     fit(small_capture, config, checkpoint=path, on_progress=keep)
     assert Checkpoint.load(kept).iteration == 21
     assert_same_result(fit(small_capture, SMALL, checkpoint=kept, resume=True), reference)
@@ -209,7 +212,7 @@ def test_checkpoint_of_another_version(begun, tmp_path, monkeypatch):
     dumps = json.dumps
     monkeypatch.setattr(json, "dumps", lambda state: dumps(state | {"version": 1}))
     begun.checkpoint().save(path)
-    with pytest.raises(FitError, match="has version 1, this program reads version 2; start anew"):
+    with pytest.raises(FitError, match="has version 1, this program reads version 3; start anew"):
         Checkpoint.load(path)
 
 
@@ -233,7 +236,7 @@ def test_a_checkpoint_that_cannot_be_written_is_found_before_the_first_iteration
 def test_the_first_checkpoint_is_as_large_as_all_others(small_capture, tmp_path):
     path = tmp_path / "c.safetensors"
     sizes = []
-    config = dataclasses.replace(TINY, checkpoint_seconds=0.0)
+    config = dataclasses.replace(TINY, checkpoint_seconds=0.0, refine="none")
     fit(small_capture, config, checkpoint=path, on_progress=lambda _: sizes.append(path.stat().st_size))
     assert len(sizes) == 3
     assert sizes[0] == pytest.approx(path.stat().st_size, rel=0.02)
@@ -250,7 +253,9 @@ def test_damaged_checkpoint_is_one_sentence(small_capture, tmp_path, content):
     "options",
     [
         {"loss": "l1"},
-        {"location": "cell"},
+        {"location": "cell", "refine": "none"},
+        {"refine": "grow"},
+        {"refine": "star", "move": False},
         {"background": "random"},
         {"background": "white", "batch_views": 3},
         {"grid": (3, 4, 5), "haze_penalty": 0.0},

@@ -272,10 +272,10 @@ def test_says_what_is_missing():
         optimizer.step()
     push = torch.ones_like(mesh.vertices)
     push[7, 1] = torch.nan
-    state = {name: tensor.clone() for name, tensor in optimizer.state().items()}
+    state = {name: tensor.clone() for name, tensor in optimizer.state().items() if name != "gradient"}
     with pytest.raises(FitError, match="vertex 7"):
         step_with(optimizer, push)
-    assert all(torch.equal(tensor, state[name]) for name, tensor in optimizer.state().items())
+    assert all(torch.equal(optimizer.state()[name], tensor) for name, tensor in state.items())
     optimizer.zero_grad()
     with pytest.raises(FitError, match="No gradient"):
         optimizer.step()

@@ -7,8 +7,8 @@ from PIL import Image
 from rich.console import Console
 
 from difftetvr.errors import CaptureError
-from difftetvr.fit.checkpoint import History
 from difftetvr.fit.evaluation import Evaluation
+from difftetvr.fit.history import History, MoveTotals, RefinementRecord
 from difftetvr.fit.progress import ProgressDisplay
 from difftetvr.fit.result import Progress
 from difftetvr.mesh import Field, TetMesh
@@ -96,11 +96,27 @@ def test_evaluation_table_has_means():
     assert "-" in text_of(evaluation_table(Evaluation([3], [20.0], [])))
 
 
+def status(**changes):
+    values = {
+        "iteration": 1,
+        "iterations": 3,
+        "loss": 0.01,
+        "train_psnr": 20.0,
+        "held_out_psnr": None,
+        "cells": 12345,
+        "moves": MoveTotals(),
+        "refinements": 0,
+        "last_refinement": None,
+        "seconds": 1.0,
+    }
+    return Progress(**(values | changes))
+
+
 def test_progress_prints_plain_lines_where_there_is_no_terminal():
     console = Console(width=60, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
     with ProgressDisplay(console) as display:
         for i in (1, 2, 3):
-            display(Progress(i, 3, 0.01, 20.0, 19.5 if i > 1 else None, 12345, float(i)))
+            display(status(iteration=i, held_out_psnr=19.5 if i > 1 else None))
     lines = console.export_text().splitlines()
     assert len(lines) == 2
     for expected in ("3/3", "1.00e-02", "20.00 dB (held out 19.50)", "12,345 cells", "it/s", "0:00 left"):
@@ -110,5 +126,20 @@ def test_progress_prints_plain_lines_where_there_is_no_terminal():
 def test_progress_draws_a_bar_on_a_terminal():
     console = Console(width=160, record=True, force_terminal=True, file=open("/dev/null", "w"))  # noqa: SIM115
     with ProgressDisplay(console) as display:
-        display(Progress(50, 100, 0.01, 20.0, None, 12345, 1.0))
+        display(status(iteration=50, iterations=100))
     assert "50/100" in console.export_text()
+
+
+def test_progress_tells_of_moves_and_refinements():
+    console = Console(width=60, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
+    record = RefinementRecord(100, 12000, 12345, 2000, 70, 80, 5, 3e-4, 2e-3, 1.8e-3)
+    with ProgressDisplay(console) as display:
+        display(status(moves=MoveTotals(50, 9000, 3, 2, 1), refinements=4, last_refinement=record))
+    text = console.export_text()
+    for expected in (
+        "1 moves refused",
+        "refinement 4: -70 +80 vertices",
+        "5 flips",
+        "gain 2.0e-04 (predicted 3.0e-04)",
+    ):
+        assert expected in text

@@ -23,27 +23,11 @@ from difftetvr.errors import MeshError
 from difftetvr.files import atomic_write
 from difftetvr.fit.config import FitConfig
 from difftetvr.fit.errors import FitError
+from difftetvr.fit.history import History
 from difftetvr.mesh.tetmesh import TetMesh
 
-_VERSION = 2
+_VERSION = 3
 _HISTORY = ("history.loss", "history.psnr")
-
-
-@dataclass
-class History:
-    """What happened so far.
-
-    Attributes:
-        loss: Loss of each iteration.
-        psnr: PSNR in dB of each iteration's training views, before its step.
-        evaluations: Pairs of iteration and mean PSNR in dB over a few held-out views.
-        seconds: Time spent, over all sessions of the run.
-    """
-
-    loss: list[float] = field(default_factory=list)
-    psnr: list[float] = field(default_factory=list)
-    evaluations: list[tuple[int, float]] = field(default_factory=list)
-    seconds: float = 0.0
 
 
 @dataclass
@@ -55,6 +39,7 @@ class Checkpoint:
         config: Options of the run.
         capture: What :func:`describe_capture` says about the images it runs on.
         tensors: Mesh, parameters and optimiser state by name.
+        budget: Cells that the mesh may have.
         history: Losses and timings up to here.
         source: What to call it in messages; the file that it was read from.
     """
@@ -63,6 +48,7 @@ class Checkpoint:
     config: FitConfig
     capture: dict[str, Any]
     tensors: dict[str, torch.Tensor]
+    budget: int
     history: History
     source: str = field(default="checkpoint", compare=False)
 
@@ -77,8 +63,8 @@ class Checkpoint:
             "iteration": self.iteration,
             "config": self.config.to_json(),
             "capture": self.capture,
-            "evaluations": self.history.evaluations,
-            "seconds": self.history.seconds,
+            "budget": self.budget,
+            **self.history.events(),
         }
         tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in self.tensors.items()}
         for name, values in zip(_HISTORY, (self.history.loss, self.history.psnr), strict=True):
@@ -161,15 +147,14 @@ def require_no_folder(path: Path) -> None:
 def _checkpoint(state: dict[str, Any], tensors: dict[str, torch.Tensor], source: str) -> Checkpoint:
     """A checkpoint from the parts of a file; whatever is wrong with them raises one of Python's own errors."""
     loss, psnr = (tensors.pop(name).tolist() for name in _HISTORY)
-    evaluations = [(int(i), float(p)) for i, p in state["evaluations"]]
-    history = History(loss, psnr, evaluations, float(state["seconds"]))
+    history = History.from_events(loss, psnr, state)
     config = FitConfig.from_json(state["config"])
     iteration, capture = state["iteration"], state["capture"]
     if not isinstance(iteration, int) or not iteration == len(loss) == len(psnr) <= config.iterations:
         raise ValueError(f"its history has {len(loss)} losses after {iteration} iterations")
     if not isinstance(capture, dict):
         raise TypeError("it does not describe its images")
-    return Checkpoint(iteration, config, capture, tensors, history, source)
+    return Checkpoint(iteration, config, capture, tensors, int(state["budget"]), history, source)
 
 
 def _checksum(state: str, tensors: dict[str, torch.Tensor]) -> str:

@@ -5,19 +5,22 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
 
 from difftetvr.fit.errors import FitError
-from difftetvr.fit.options import options_from_json
+from difftetvr.fit.options import options_from_json, require
+from difftetvr.fit.positions import VertexOptimizerConfig
+from difftetvr.fit.refinement import Exchange, Grow, Star, Strategy
 from difftetvr.mesh.faces import MAX_CELLS
 
 Background = Literal["black", "white", "random"] | tuple[float, float, float]
 
 _CELLS_PER_CUBE = 6
-_BACKGROUND_STREAM = 1
+# Independent streams of random numbers.
+_VIEW_STREAM, _BACKGROUND_STREAM, _REFINEMENT_STREAM = range(3)
 _BACKGROUND_COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 _LARGEST_COUNT = 2**31 - 1
 # Least and greatest value of options that count something.
@@ -28,13 +31,31 @@ _RANGES = {
     "evaluate_every": (0, _LARGEST_COUNT),
     "seed": (0, _LARGEST_COUNT),
 }
+_STRATEGIES = ("exchange", "grow", "star", "none")
 # Options that change nothing about where the optimisation goes: a resumed run may choose them anew.
 _FREE_OPTIONS = frozenset({"device", "evaluate_every", "checkpoint_seconds"})
 
 
 @dataclass(frozen=True)
+class Motion(VertexOptimizerConfig):
+    """How vertices move."""
+
+    boundary: Literal["fixed", "slide"] = "slide"
+    """Whether vertices on the boundary stay, or slide in their plane or along their crease."""
+    every: int = 2
+    """Iterations whose gradients make one move."""
+    until: float = 0.95
+    """Share of the run after which vertices stay."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(self.every >= 1, "every", self.every, "at least 1")
+        require(0 < self.until <= 1, "until", self.until, "greater than 0 and at most 1")
+
+
+@dataclass(frozen=True)
 class FitConfig:
-    """How colours and densities are optimised on a fixed tetrahedral grid.
+    """How colours, densities and vertex positions are optimised while the mesh refines itself.
 
     The defaults reconstruct the Tooth benchmark. Rates are steps of Adam per iteration in units of the quantity:
     colours live in [0, 1], densities are counted in units of the capture's density (that of opacity 1 in a volume).
@@ -43,12 +64,17 @@ class FitConfig:
     """
 
     cells: int = 20_000
-    """Budget of tetrahedra; the grid nearest to it with near-cubic cubes is built over the capture's bounds."""
+    """Budget of tetrahedra. The run begins with a grid of near-cubic cubes over the capture's bounds."""
     grid: tuple[int, int, int] | None = None
-    """Cubes along x, y and z; overrides --cells. Each cube holds 6 tetrahedra."""
+    """Cubes of that grid along x, y and z, 6 tetrahedra each; overrides --cells, unless the mesh is to grow."""
+    move: bool = True
+    """Whether vertices move."""
+    refine: Literal["exchange", "grow", "star", "none"] = "exchange"
+    """How the mesh refines itself: exchange cells at their full number, grow from a coarse mesh, subdivide stars as in
+    the article, or not at all."""
     location: Literal["vertex", "cell"] = "vertex"
     """Whether colour and density belong to vertices, linear in between, or to cells, constant inside."""
-    iterations: int = 1000
+    iterations: int = 2400
     """Number of optimisation steps."""
     batch_views: int = 1
     """Training views per step; their gradients are averaged."""
@@ -79,32 +105,63 @@ class FitConfig:
     """Iterations between glances at a few held-out views, for the curves only; 0: never."""
     checkpoint_seconds: float = 30.0
     """Seconds between checkpoints."""
+    motion: Motion = field(default_factory=Motion)
+    """How vertices move."""
+    exchange: Exchange = field(default_factory=Exchange)
+    """Options of --refine exchange."""
+    grow: Grow = field(default_factory=Grow)
+    """Options of --refine grow."""
+    star: Star = field(default_factory=Star)
+    """Options of --refine star."""
 
     def __post_init__(self) -> None:
         for name, (least, most) in _RANGES.items():
             value = getattr(self, name)
-            _require(least <= value <= most, name, value, f"at least {least} and at most {most}")
+            require(least <= value <= most, name, value, f"at least {least} and at most {most}")
         for name in ("rate", "final_rate"):
-            _require(_positive(getattr(self, name)), name, getattr(self, name), "greater than 0 and finite")
+            require(_positive(getattr(self, name)), name, getattr(self, name), "greater than 0 and finite")
         for name in ("haze_penalty", "initial_density", "checkpoint_seconds"):
             value = getattr(self, name)
-            _require(value >= 0 and math.isfinite(value), name, value, "at least 0 and finite")
-        _require(0 <= self.initial_color <= 1, "initial_color", self.initial_color, "between 0 and 1")
-        _require(all(0 <= b < 1 for b in self.betas), "betas", self.betas, "at least 0 and less than 1")
-        _require(self.location in ("vertex", "cell"), "location", self.location, "vertex or cell")
-        _require(self.loss in ("l1", "l2"), "loss", self.loss, "l1 or l2")
+            require(value >= 0 and math.isfinite(value), name, value, "at least 0 and finite")
+        require(0 <= self.initial_color <= 1, "initial_color", self.initial_color, "between 0 and 1")
+        require(all(0 <= b < 1 for b in self.betas), "betas", self.betas, "at least 0 and less than 1")
+        require(self.location in ("vertex", "cell"), "location", self.location, "vertex or cell")
+        require(self.loss in ("l1", "l2"), "loss", self.loss, "l1 or l2")
+        require(self.refine in _STRATEGIES, "refine", self.refine, f"one of {', '.join(_STRATEGIES)}")
+        on_cells = self.location == "cell" and self.refine != "none"
+        require(not on_cells, "refine", self.refine, "none where colours belong to cells (location cell)")
         if self.grid is not None:
-            _require(min(self.grid) >= 1, "grid", self.grid, "at least 1 cube along each axis")
+            require(min(self.grid) >= 1, "grid", self.grid, "at least 1 cube along each axis")
             fits = math.prod(self.grid) <= MAX_CELLS // _CELLS_PER_CUBE
-            _require(fits, "grid", self.grid, f"at most {MAX_CELLS // _CELLS_PER_CUBE} cubes in all")
+            require(fits, "grid", self.grid, f"at most {MAX_CELLS // _CELLS_PER_CUBE} cubes in all")
         named = isinstance(self.background, str)
         valid = self.background in ("black", "white", "random") if named else _is_color(self.background)
-        _require(valid, "background", self.background, "black, white, random or three values in [0, 1]")
+        require(valid, "background", self.background, "black, white, random or three values in [0, 1]")
 
     @property
     def needs_alpha(self) -> bool:
         """Whether training images must be composited over something that is not black."""
         return self.background not in ("black", (0.0, 0.0, 0.0))
+
+    def strategy(self) -> Strategy | None:
+        """How the mesh is refined; None if it is not."""
+        return None if self.refine == "none" else getattr(self, self.refine)
+
+    def motion_rate_at(self, iteration: int) -> float | None:
+        """Length of the vertices' steps, in altitudes; None where they stay."""
+        progress = iteration / (self.motion.until * self.iterations)
+        return self.motion.rate_at(progress) if self.move and progress < 1.0 else None
+
+    def refinement_views_at(self, iteration: int, count: int, view_count: int) -> list[int]:
+        """Positions, in [0, view_count), of the random training views that a refinement is judged on.
+
+        Args:
+            iteration: Iterations done.
+            count: How many; all views where there are fewer.
+            view_count: Number of training views.
+        """
+        random = np.random.default_rng([self.seed, _REFINEMENT_STREAM, iteration])
+        return [int(k) for k in random.permutation(view_count)[:count]]
 
     def rate_at(self, iteration: int) -> float:
         """Learning rate of a step, log-linear from ``rate`` (iteration 0) to ``final_rate`` (the last one)."""
@@ -162,7 +219,7 @@ class FitConfig:
 
     def _view(self, position: int, view_count: int) -> int:
         epoch, offset = divmod(position, view_count)
-        return int(np.random.default_rng([self.seed, 0, epoch]).permutation(view_count)[offset])
+        return int(np.random.default_rng([self.seed, _VIEW_STREAM, epoch]).permutation(view_count)[offset])
 
 
 def grid_cubes(cells: int, extent: Sequence[float]) -> tuple[int, int, int]:
@@ -184,11 +241,6 @@ def grid_cubes(cells: int, extent: Sequence[float]) -> tuple[int, int, int]:
     best = np.lexsort((np.abs(np.log(edges / edge)), error))[0]
     nx, ny, nz = (int(n) for n in candidates[best])
     return nx, ny, nz
-
-
-def _require(condition: bool, name: str, value: object, rule: str) -> None:
-    if not condition:
-        raise FitError(f"The option {name} is {value}; it must be {rule}.")
 
 
 def _positive(value: float) -> bool:

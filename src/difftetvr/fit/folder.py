@@ -55,6 +55,11 @@ class RunFolder:
         return self.path / "comparison.png"
 
     @property
+    def cut(self) -> Path:
+        """A cut through the mesh: what it holds, and where its cells are."""
+        return self.path / "cut.png"
+
+    @property
     def views(self) -> Path:
         """Folder of single pictures of held-out views."""
         return self.path / "views"
@@ -135,7 +140,7 @@ class RunFolder:
     def _clear(self) -> None:
         # The checkpoint goes first and the options last: cut short, this never leaves a state to resume from without
         # the options that it belongs to.
-        for path in (self.checkpoint, self.model, self.metrics, self.curves, self.comparison):
+        for path in (self.checkpoint, self.model, self.metrics, self.curves, self.comparison, self.cut):
             path.unlink(missing_ok=True)
         for pattern in ("*_truth.png", "*_reconstruction.png"):
             for picture in self.views.glob(pattern):

@@ -12,13 +12,24 @@ from difftetvr.fit.errors import FitError
 _Options = TypeVar("_Options")
 
 
+def require(condition: bool, name: str, value: object, rule: str) -> None:
+    """Checks an option.
+
+    Raises:
+        FitError: The condition does not hold; names option, value and rule.
+    """
+    if not condition:
+        raise FitError(f"The option {name} is {value}; it must be {rule}.")
+
+
 def options_from_json(kind: type[_Options], values: object) -> _Options:
     """An instance of a dataclass from JSON values by field name; fields that are not given keep their defaults.
 
     JSON knows no tuples: lists stand for them.
 
     Args:
-        kind: Dataclass whose fields are bool, int, float, str, None, literals, tuples, or unions of these.
+        kind: Dataclass whose fields are bool, int, float, str, None, literals, tuples, unions of these, or such
+            dataclasses.
         values: Parsed JSON.
 
     Raises:
@@ -33,6 +44,9 @@ def options_from_json(kind: type[_Options], values: object) -> _Options:
             raise FitError(
                 f"The saved options hold '{name}', which this version does not know; start anew with --overwrite."
             )
+        if dataclasses.is_dataclass(declared[name]):
+            options[name] = options_from_json(declared[name], value)
+            continue
         options[name] = _with_tuples(value)
         if not _fits(options[name], declared[name]):
             raise FitError(

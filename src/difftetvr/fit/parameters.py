@@ -7,16 +7,18 @@ from collections.abc import Iterator
 import torch
 
 from difftetvr.fit.config import FitConfig
+from difftetvr.mesh.change import MeshChange
 from difftetvr.mesh.field import Field
 from difftetvr.mesh.tetmesh import TetMesh
 
 _NAMES = ("color", "density")
+_FIRST, _SECOND = "exp_avg", "exp_avg_sq"  # Adam's names of its moments
 # Gradients of a mean over pixels shrink as cells and pixels do; Adam's usual 1e-8 would drown those of fine meshes.
 _EPSILON = 1e-15
 
 
 class FieldParameters:
-    """Colours and densities on a fixed mesh, with their Adam optimiser.
+    """Colours and densities on a mesh, with their Adam optimiser.
 
     Density is stored in units of the capture's typical density, so that one learning rate fits scenes of any size.
     After each step the parameters are projected to the valid ranges, colours to [0, 1] and densities to [0, inf):
@@ -41,10 +43,11 @@ class FieldParameters:
         )
         # Adam would make its state in the first step; made here, a checkpoint holds the same arrays from the start.
         for parameter in (self.color, self.density):
+            zeros = torch.zeros_like(parameter, requires_grad=False)
             self._optimizer.state[parameter] = {
                 "step": torch.zeros((), device=device),
-                "exp_avg": torch.zeros_like(parameter, requires_grad=False),
-                "exp_avg_sq": torch.zeros_like(parameter, requires_grad=False),
+                _FIRST: zeros,
+                _SECOND: zeros.clone(),
             }
 
     def field(self) -> Field:
@@ -55,6 +58,41 @@ class FieldParameters:
         """A copy of the field as it is now, without gradients."""
         color, density = self.color.detach().clone(), self.density_unit * self.density.detach()
         return Field(color, density, location=self.location)
+
+    def values(self) -> torch.Tensor:
+        """(N, 4) copy of all parameters: linear RGB, and density in units of ``density_unit``."""
+        return torch.cat((self.color.detach(), self.density.detach()[:, None]), 1)
+
+    def carry(self, change: MeshChange) -> None:
+        """Follows a change of the mesh, for parameters on vertices.
+
+        Kept vertices keep their values and moments. New ones start with interpolated values at rest: first moment 0,
+        second moment the mean of the ends of the edge they lie on. The count of steps goes on for all.
+
+        Args:
+            change: What was done to the mesh.
+        """
+        for name, parameter in list(self._items()):
+            state = self._optimizer.state.pop(parameter)
+            first = change.carry(state[_FIRST])
+            is_new = change.is_new.view(-1, *[1] * (first.ndim - 1))
+            state[_FIRST] = torch.where(is_new, 0.0, first)
+            state[_SECOND] = change.carry(state[_SECOND])
+            carried = change.carry(parameter.detach()).requires_grad_()
+            self._optimizer.state[carried] = state
+            setattr(self, name, carried)
+        self._optimizer.param_groups[0]["params"] = [parameter for _, parameter in self._items()]
+
+    def add(self, surplus: torch.Tensor) -> None:
+        """Changes the values, and projects them to the valid ranges.
+
+        Args:
+            surplus: (N, 4), in the order of :meth:`values`.
+        """
+        with torch.no_grad():
+            self.color += surplus[:, :3]
+            self.density += surplus[:, 3]
+        self._project()
 
     def zero_grad(self) -> None:
         """Forgets the gradients before the views of a step are accumulated."""
@@ -73,9 +111,7 @@ class FieldParameters:
         if haze_penalty and self.density.grad is not None:
             self.density.grad += haze_penalty * self.density.grad.abs().mean()
         self._optimizer.step()
-        with torch.no_grad():
-            self.color.clamp_(0.0, 1.0)
-            self.density.clamp_(min=0.0)
+        self._project()
 
     def state(self) -> dict[str, torch.Tensor]:
         """Parameters and optimiser state by name: all that the next step depends on."""
@@ -94,6 +130,11 @@ class FieldParameters:
         with torch.no_grad():
             for name, tensor in self.state().items():
                 tensor.copy_(tensors[name])
+
+    def _project(self) -> None:
+        with torch.no_grad():
+            self.color.clamp_(0.0, 1.0)
+            self.density.clamp_(min=0.0)
 
     def _items(self) -> Iterator[tuple[str, torch.Tensor]]:
         return ((name, getattr(self, name)) for name in _NAMES)

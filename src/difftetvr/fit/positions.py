@@ -9,6 +9,7 @@ from typing import Literal
 import torch
 
 from difftetvr.fit.errors import FitError
+from difftetvr.fit.options import require
 from difftetvr.mesh.boundary import BoundaryConstraint
 from difftetvr.mesh.change import MeshChange
 from difftetvr.mesh.motion import MotionLimits, cap_move, guard_move
@@ -53,14 +54,14 @@ class VertexOptimizerConfig:
     def __post_init__(self) -> None:
         for name in ("rate", "final_rate"):
             value = getattr(self, name)
-            _require(value > 0 and math.isfinite(value), name, value, "greater than 0 and finite")
-        _require(all(0 <= beta < 1 for beta in self.betas), "betas", self.betas, "at least 0 and below 1")
+            require(value > 0 and math.isfinite(value), name, value, "greater than 0 and finite")
+        require(all(0 <= beta < 1 for beta in self.betas), "betas", self.betas, "at least 0 and below 1")
         for name in ("barrier", "wall"):
             value = getattr(self, name)
-            _require(value >= 0 and math.isfinite(value), name, value, "at least 0 and finite")
-        _require(0 < self.cap < 0.25, "cap", self.cap, "between 0 and 0.25")
-        _require(0 <= self.coplanarity < 1, "coplanarity", self.coplanarity, "at least 0 and below 1")
-        _require(self.boundary in ("fixed", "slide"), "boundary", self.boundary, "fixed or slide")
+            require(value >= 0 and math.isfinite(value), name, value, "at least 0 and finite")
+        require(0 < self.cap < 0.25, "cap", self.cap, "between 0 and 0.25")
+        require(0 <= self.coplanarity < 1, "coplanarity", self.coplanarity, "at least 0 and below 1")
+        require(self.boundary in ("fixed", "slide"), "boundary", self.boundary, "fixed or slide")
 
     def rate_at(self, progress: float) -> float:
         """Rate of a step.
@@ -166,9 +167,11 @@ class VertexOptimizer:
         self.mesh, self._constraint = self._adopted(change.mesh)
 
     def state(self) -> dict[str, torch.Tensor]:
-        """All that the next step depends on besides the cells, by name."""
+        """All that the next step depends on besides the cells, by name; gradients gathered for it included."""
+        gradient = self.mesh.vertices.grad
         return {
             "vertices": self.mesh.vertices.detach(),
+            "gradient": torch.zeros_like(self.mesh.vertices.detach()) if gradient is None else gradient,
             "first_moment": self._first,
             "second_moment": self._second,
             "steps": torch.tensor(self.steps),
@@ -189,12 +192,16 @@ class VertexOptimizer:
         except KeyError as error:
             raise FitError(f"The state of the vertices lacks {error}; pass what state() returned.") from error
         count = self.mesh.num_vertices
-        if copies["vertices"].shape != (count, 3) or copies["second_moment"].shape != (count,):
+        if not copies["vertices"].shape == copies["gradient"].shape == (count, 3) or copies["second_moment"].shape != (
+            count,
+        ):
             raise FitError(
                 f"The saved state has {len(copies['vertices'])} vertices, this mesh has {count}; "
                 "restore it on the mesh that it was saved with."
             )
         self.mesh = self.mesh.with_vertices(copies["vertices"].requires_grad_())
+        if copies["gradient"].any():
+            self.mesh.vertices.grad = copies["gradient"]
         self._first, self._second = copies["first_moment"], copies["second_moment"]
         self.steps = int(copies["steps"])
         self._constraint = BoundaryConstraint(*(copies[f"boundary.{name}"] for name in _CONSTRAINT))
@@ -239,8 +246,3 @@ class VertexOptimizer:
         least = max((start - floor) / _WALL_STEEPNESS, torch.finfo(quality.dtype).tiny)
         nearness = (start - quality).clamp_min_(0.0) / (quality - floor).clamp_min_(least)
         return nearness.mul_(self.config.wall).add_(self.config.barrier)
-
-
-def _require(condition: bool, name: str, value: object, rule: str) -> None:
-    if not condition:
-        raise FitError(f"The option {name} is {value}; it must be {rule}.")

@@ -8,13 +8,16 @@ from types import TracebackType
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
+from difftetvr.fit.history import RefinementRecord
 from difftetvr.fit.result import Progress as Status
 
 _LINE_SECONDS = 5.0
 
 
 class ProgressDisplay:
-    """Shows iteration, loss, PSNR, cells, speed and time left; a context manager to be passed as ``on_progress``.
+    """Shows where a run stands, its last refinement, and the time left.
+
+    A context manager to be passed as ``on_progress``.
 
     Args:
         console: Where to print; default: standard output.
@@ -63,9 +66,19 @@ def _describe(status: Status, speed: float | None) -> str:
         f"PSNR {status.train_psnr:.2f} dB{held_out}",
         f"{status.cells:,} cells",
     ]
+    if status.moves.steps:
+        parts.append(f"{status.moves.refused:,} moves refused")
+    if status.last_refinement is not None:
+        parts.append(_describe_refinement(status.refinements, status.last_refinement))
     if speed is not None:
         parts += [f"{speed:.1f} it/s", f"{_clock((status.iterations - status.iteration) / speed)} left"]
     return "  ".join(parts)
+
+
+def _describe_refinement(count: int, last: RefinementRecord) -> str:
+    predicted = "-" if last.predicted is None else f"{last.predicted:.1e}"
+    changes = f"-{last.collapsed} +{last.bisected} vertices, {last.flipped} flips"
+    return f"refinement {count}: {changes}, gain {last.achieved:.1e} (predicted {predicted})"
 
 
 def _clock(seconds: float) -> str:

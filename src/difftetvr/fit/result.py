@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
-from difftetvr.fit.checkpoint import History
 from difftetvr.fit.config import FitConfig
 from difftetvr.fit.evaluation import Evaluation
+from difftetvr.fit.history import History, MoveTotals, RefinementRecord
 from difftetvr.mesh.field import Field
 from difftetvr.mesh.tetmesh import TetMesh
 
@@ -25,6 +25,9 @@ class Progress:
         train_psnr: Mean PSNR in dB over the same.
         held_out_psnr: PSNR in dB at the last glance at a few held-out views; None before the first.
         cells: Tetrahedra.
+        moves: What became of the moves of vertices so far.
+        refinements: Refinements so far.
+        last_refinement: The last one; None before the first.
         seconds: Time spent so far, over all sessions.
     """
 
@@ -34,6 +37,9 @@ class Progress:
     train_psnr: float
     held_out_psnr: float | None
     cells: int
+    moves: MoveTotals
+    refinements: int
+    last_refinement: RefinementRecord | None
     seconds: float
 
 
@@ -61,7 +67,7 @@ class FitResult:
 
         ``psnr`` and ``ssim`` are means over the held-out views (None if there are none), ``psnr_per_view`` and
         ``ssim_per_view`` belong to ``views``, ``train_psnr`` is the mean over the views of the last 64
-        iterations, ``seconds`` the time of the optimisation.
+        iterations, ``seconds`` the time of the optimisation. ``moves`` and ``refinements`` are those of the history.
         """
         last = self.history.psnr[-_TRAIN_WINDOW:]
         return {
@@ -70,5 +76,7 @@ class FitResult:
             "cells": self.mesh.num_cells,
             "vertices": self.mesh.num_vertices,
             "iterations": len(self.history.loss),
+            "moves": asdict(self.history.moves),
+            "refinements": [{**asdict(r), "achieved": r.achieved} for r in self.history.refinements],
             "seconds": self.history.seconds,
         }

@@ -31,7 +31,7 @@ def save_png(path: str | Path, image: torch.Tensor) -> None:
     Raises:
         CaptureError: The file cannot be written, or its name does not end in .png.
     """
-    _write(Path(path), Image.fromarray(_to_bytes(image)))
+    save_picture(path, to_picture(image))
 
 
 def comparison(truth: torch.Tensor, reconstruction: torch.Tensor, name: str = "truth") -> Image.Image:
@@ -50,7 +50,7 @@ def comparison(truth: torch.Tensor, reconstruction: torch.Tensor, name: str = "t
         (f"reconstruction, {psnr(reconstruction, truth):.2f} dB", reconstruction),
         (f"difference x {_DIFFERENCE_GAIN}", difference),
     ]
-    return _beside([_labelled(image, label) for label, image in panels])
+    return beside([labelled(to_picture(image), label) for label, image in panels])
 
 
 def save_comparisons(path: str | Path, rows: list[tuple[str, torch.Tensor, torch.Tensor]]) -> None:
@@ -64,31 +64,31 @@ def save_comparisons(path: str | Path, rows: list[tuple[str, torch.Tensor, torch
         CaptureError: The file cannot be written, or its name does not end in .png.
     """
     pictures = [comparison(truth, reconstruction, name) for name, truth, reconstruction in rows]
-    height = sum(p.height for p in pictures) + _GAP * (len(pictures) - 1)
-    sheet = Image.new("RGB", (max(p.width for p in pictures), height), "white")
-    top = 0
-    for picture in pictures:
-        sheet.paste(picture, (0, top))
-        top += picture.height + _GAP
-    _write(Path(path), sheet)
+    save_picture(path, below(pictures))
 
 
 def _to_bytes(image: torch.Tensor) -> np.ndarray:
     return (image.detach().cpu().clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).numpy()
 
 
-def _labelled(image: torch.Tensor, label: str) -> Image.Image:
-    pixels = Image.fromarray(_to_bytes(image))
-    enlargement = max(1, -(-_LEAST_PANEL // min(pixels.size)))
-    pixels = pixels.resize((pixels.width * enlargement, pixels.height * enlargement), Image.Resampling.NEAREST)
-    panel = Image.new("RGB", (pixels.width, pixels.height + _LABEL_HEIGHT), "white")
-    panel.paste(pixels, (0, _LABEL_HEIGHT))
+def to_picture(image: torch.Tensor) -> Image.Image:
+    """The picture that :func:`save_png` writes."""
+    return Image.fromarray(_to_bytes(image))
+
+
+def labelled(picture: Image.Image, label: str) -> Image.Image:
+    """A panel of a sheet: a picture under its label; small pictures are enlarged by repeating pixels."""
+    enlargement = max(1, -(-_LEAST_PANEL // min(picture.size)))
+    size = (picture.width * enlargement, picture.height * enlargement)
+    panel = Image.new("RGB", (size[0], size[1] + _LABEL_HEIGHT), "white")
+    panel.paste(picture.resize(size, Image.Resampling.NEAREST), (0, _LABEL_HEIGHT))
     font = ImageFont.load_default(size=_FONT_SIZE)
     ImageDraw.Draw(panel).text((6, 4), label, fill="black", font=font)
     return panel
 
 
-def _beside(panels: list[Image.Image]) -> Image.Image:
+def beside(panels: list[Image.Image]) -> Image.Image:
+    """Pictures in a row."""
     width = sum(p.width for p in panels) + _GAP * (len(panels) - 1)
     row = Image.new("RGB", (width, max(p.height for p in panels)), "white")
     left = 0
@@ -96,6 +96,17 @@ def _beside(panels: list[Image.Image]) -> Image.Image:
         row.paste(panel, (left, 0))
         left += panel.width + _GAP
     return row
+
+
+def below(rows: list[Image.Image]) -> Image.Image:
+    """Pictures one below the other."""
+    height = sum(p.height for p in rows) + _GAP * (len(rows) - 1)
+    sheet = Image.new("RGB", (max(p.width for p in rows), height), "white")
+    top = 0
+    for row in rows:
+        sheet.paste(row, (0, top))
+        top += row.height + _GAP
+    return sheet
 
 
 def require_png(path: Path) -> None:
@@ -108,7 +119,17 @@ def require_png(path: Path) -> None:
         raise CaptureError(f"Pictures are written as PNG, but {path} does not end in .png; rename it.")
 
 
-def _write(path: Path, picture: Image.Image) -> None:
+def save_picture(path: str | Path, picture: Image.Image) -> None:
+    """Writes a picture as PNG, whole or not at all.
+
+    Args:
+        path: File to write.
+        picture: What to write.
+
+    Raises:
+        CaptureError: The file cannot be written, or its name does not end in .png.
+    """
+    path = Path(path)
     require_png(path)
     with atomic_write(path, CaptureError) as temporary:
         picture.save(temporary, format="PNG")

@@ -8,7 +8,8 @@ from difftetvr.fit.evaluation import rendered_image, true_image
 from difftetvr.fit.folder import RunFolder, write_json
 from difftetvr.fit.result import FitResult
 from difftetvr.mesh.io import save
-from difftetvr.view.pictures import save_comparisons, save_png
+from difftetvr.view.cut import cut_picture
+from difftetvr.view.pictures import save_comparisons, save_picture, save_png
 from difftetvr.view.plots import save_curves
 
 _COMPARED_VIEWS = 4
@@ -33,6 +34,7 @@ def write_report(folder: RunFolder, result: FitResult, capture: Capture) -> None
     save(folder.model, result.mesh, result.field)
     save_curves(folder.curves, result.history)
     _write_pictures(folder, result, capture)
+    save_picture(folder.cut, cut_picture(result.mesh, result.field))
     write_json(folder.metrics, {"capture": capture.name, **result.metrics})
 
 

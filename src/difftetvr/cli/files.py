@@ -1,0 +1,105 @@
+"""The commands that look at files and write other ones: ``difftetvr eval | info | export``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import OmitArgPrefixes, Positional, arg
+
+from difftetvr.cli.options import CaptureOptions, load_model
+from difftetvr.errors import MeshError
+from difftetvr.files import require_writable
+from difftetvr.fit.errors import FitError
+from difftetvr.fit.folder import write_json
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+@dataclass(frozen=True)
+class Eval:
+    """Compare a reconstructed volume with the held-out views of a capture."""
+
+    model: Annotated[Path, Positional, arg(metavar="MODEL")]
+    """Mesh with color and density."""
+    capture: Annotated[str, Positional, arg(metavar="CAPTURE")]
+    """tooth, or the path of a volume or of a saved capture (.npz)."""
+    output: Annotated[Path | None, arg(aliases=["-o"])] = None
+    """File to write the numbers to, JSON."""
+    all_views: bool = False
+    """Compare with the training views, too."""
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Linear R G B behind the volume."""
+    device: str | None = None
+    """Where to render."""
+    views_of: OmitArgPrefixes[CaptureOptions] = field(default_factory=CaptureOptions)
+
+    def run(self, console: Console) -> None:
+        """Renders the views and prints PSNR and SSIM of each."""
+        from difftetvr.fit.evaluation import evaluate
+        from difftetvr.view.describe import evaluation_table
+
+        if self.output is not None:
+            require_writable(self.output, FitError)
+        mesh, field_on_mesh = load_model(self.model, self.device)
+        capture = self.views_of.load(self.capture, console)
+        views = list(range(len(capture.cameras))) if self.all_views else capture.test_indices.tolist()
+        if not views:
+            raise FitError(f"'{capture.name}' holds out no views; compare with all of them with --all-views.")
+        evaluation = evaluate(mesh, field_on_mesh, capture, views, self.background)
+        console.print(evaluation_table(evaluation))
+        if self.output is not None:
+            write_json(self.output, evaluation.to_json())
+
+
+@dataclass(frozen=True)
+class Info:
+    """Describe a mesh or a capture."""
+
+    file: Annotated[str, Positional, arg(metavar="FILE")]
+    """A mesh (.vtu, .vtk, .msh, .mesh, .xdmf, .npz), a volume, a saved capture (.npz), or tooth."""
+    views_of: OmitArgPrefixes[CaptureOptions] = field(default_factory=CaptureOptions)
+
+    def run(self, console: Console) -> None:
+        """Prints tables."""
+        from difftetvr.view.describe import capture_table, mesh_tables
+
+        path = Path(self.file)
+        if _is_capture(path):
+            console.print(capture_table(self.file, self.views_of.load(self.file, console)))
+            return
+        from difftetvr.mesh.io import load_with_optional_field
+
+        for table in mesh_tables(self.file, *load_with_optional_field(path)):
+            console.print(table)
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write a reconstructed volume in another format."""
+
+    model: Annotated[Path, Positional, arg(metavar="MODEL")]
+    """Mesh with color and density."""
+    output: Annotated[Path, Positional, arg(metavar="OUT")]
+    """File to write: .vtu, .vtk, .msh or .npz."""
+
+    def run(self, console: Console) -> None:
+        """Reads and writes."""
+        from difftetvr.mesh.io import load, require_writable_format, save
+
+        require_writable_format(self.output)
+        require_writable(self.output, MeshError)
+        mesh, field_on_mesh = load(self.model)
+        save(self.output, mesh, field_on_mesh)
+        console.print(f"Wrote {self.output} ({mesh.num_cells:,} cells)")
+
+
+def _is_capture(path: Path) -> bool:
+    from difftetvr.capture.volume import is_volume_file
+    from difftetvr.capture.volume_capture import TOOTH
+    from difftetvr.mesh.io import is_mesh_archive
+
+    is_saved_capture = path.suffix.lower() == ".npz" and path.is_file() and not is_mesh_archive(path)
+    return str(path) == TOOTH or is_volume_file(path) or is_saved_capture

@@ -1,0 +1,224 @@
+"""Refinement by predicted gain: cells go from where they are worth least to where they win most."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+
+from difftetvr.fit.options import require
+from difftetvr.fit.refinement.gains import (
+    CollapseCosts,
+    bisection_gains,
+    collapse_costs,
+    edges_before,
+    flip_gains,
+)
+from difftetvr.fit.refinement.strategy import Moment, Refinement, Situation
+from difftetvr.mesh.arrays import true_indices
+from difftetvr.mesh.bisection import bisect_edges, independent_edges, long_edges
+from difftetvr.mesh.change import MeshChange
+from difftetvr.mesh.collapse import collapse_edges
+from difftetvr.mesh.flip_search import find_flips
+from difftetvr.mesh.flips import THREE_TO_TWO, TWO_TO_THREE, apply_flips, independent_flips
+from difftetvr.mesh.incidence import cell_edges, find_edges
+from difftetvr.mesh.tetmesh import TetMesh
+from difftetvr.render.gauss_newton import ImageModel
+
+_LOOKED_AT = 4.0
+"""Vertices whose collapse is priced, in units of those that may vanish."""
+
+
+@dataclass(frozen=True)
+class Exchange:
+    """A constant number of cells: collapse what predicts the least loss, bisect what predicts the most gain.
+
+    A prediction is that of the quadratic model of the squared error (see `difftetvr.render.gauss_newton`) for one
+    change alone: g^2 / 2h in one dimension, here in the four of colour and density.
+    """
+
+    rounds: int = 40
+    """How often the mesh is refined, evenly spread."""
+    until: float = 0.85
+    """Share of the run after which it is not refined any more."""
+    share: float = 0.08
+    """Share of the cells that one round takes away."""
+    views: int = 12
+    """Random training views on which gains and losses are predicted."""
+    start: float = 0.6
+    """New vertices start at this part of their best surplus over the interpolated values."""
+    long: float = 0.6
+    """Edges that are at least this long in each of their cells, in units of the longest one, may be bisected."""
+    min_quality: float = 0.1
+    """Least quality Q of cells that a collapse leaves."""
+    initial: float = 1.0
+    """Cells to begin with, as a share of the budget."""
+    flips: bool = True
+    """Whether to flip faces and edges where that predicts a gain, before anything else."""
+    boundary: Literal["fixed", "slide"] = "slide"
+    """Whether vertices on the boundary may be taken away where its shape does not need them."""
+
+    def __post_init__(self) -> None:
+        require(self.rounds >= 1, "rounds", self.rounds, "at least 1")
+        require(self.views >= 1, "views", self.views, "at least 1")
+        require(0 <= self.until <= 1, "until", self.until, "between 0 and 1")
+        require(0 <= self.share < 1, "share", self.share, "at least 0 and below 1")
+        require(0 < self.initial <= 1, "initial", self.initial, "greater than 0 and at most 1")
+        for name in ("start", "long", "min_quality"):
+            require(0 <= getattr(self, name) <= 1, name, getattr(self, name), "between 0 and 1")
+
+    def initial_cells(self, budget: int) -> int:
+        """See `Strategy.initial_cells`."""
+        return max(1, round(self.initial * budget))
+
+    def is_due(self, moment: Moment) -> bool:
+        """See `Strategy.is_due`: at the ends of equal parts of the time until the last refinement."""
+        return self._rounds_done(moment.iteration, moment) > self._rounds_done(moment.iteration - 1, moment)
+
+    def lets_move(self, moment: Moment) -> bool:
+        """See `Strategy.lets_move`: always."""
+        return True
+
+    def target(self, moment: Moment) -> int:
+        """Cells after the refinement at a moment: they grow by equal factors, up to the budget."""
+        return round(moment.budget * self.initial ** (1.0 - self._rounds_done(moment.iteration, moment) / self.rounds))
+
+    def refine(self, situation: Situation) -> Refinement | None:
+        """See `Strategy.refine`."""
+        model = situation.model()
+        exchange = _Exchange(situation.mesh, situation.values, model)
+        if self.flips:
+            exchange.flip(model, self)
+        if self.share:
+            exchange.collapse(model, self)
+        exchange.bisect(self.target(situation.moment), self)
+        return exchange.refinement()
+
+    def _rounds_done(self, iteration: int, moment: Moment) -> int:
+        last = self.until * moment.iterations
+        return min(self.rounds, int(self.rounds * max(iteration, 0) / last)) if last else 0
+
+
+@dataclass(frozen=True)
+class Grow(Exchange):
+    """Growth from a coarse mesh to the budget, by the same predictions; each round also collapses some cells."""
+
+    share: float = 0.04
+    """Share of the cells that one round takes away."""
+    initial: float = 0.1
+    """Cells to begin with, as a share of the budget."""
+
+
+class _Exchange:
+    """One round: the mesh so far, and what is known about its edges."""
+
+    def __init__(self, mesh: TetMesh, values: torch.Tensor, model: ImageModel) -> None:
+        self.mesh, self.values = mesh, values
+        gains = bisection_gains(mesh, values, model.edges)
+        self.gain, self.surplus = gains.gain, gains.surplus
+        self.changes: list[MeshChange] = []
+        self.predicted = 0.0
+        self.flipped = self.collapsed = self.bisected = 0
+
+    def flip(self, model: ImageModel, options: Exchange) -> None:
+        """Cut the same space otherwise where that fits the images better."""
+        flips = find_flips(self.mesh, min_quality=options.min_quality)
+        # A 2-3 flip makes a cell more, a 3-2 flip one less: one that a bisection could use.
+        cells = torch.where(flips.kind == TWO_TO_THREE, 1, torch.where(flips.kind == THREE_TO_TWO, -1, 0))
+        gain = flip_gains(flips, self.values, model) - self._price_of_a_cell(options) * cells
+        worthwhile = true_indices(gain > 0)
+        flips, gain = flips.select(worthwhile), gain[worthwhile]
+        chosen = independent_flips(flips, gain)
+        self.flipped = len(chosen)
+        self.predicted += float(flip_gains(chosen, self.values, model).sum())
+        change = apply_flips(chosen, torch.zeros(len(chosen)))
+        self._carry_edges(change)
+        self._apply(change)
+
+    def collapse(self, model: ImageModel, options: Exchange) -> None:
+        """Take the cheapest cells away."""
+        share = min(1.0, _LOOKED_AT * options.share)
+        costs = collapse_costs(self.mesh, self.values, model.vertices, share)
+        change = collapse_edges(
+            self.mesh,
+            costs.edges,
+            costs.target,
+            costs.cost / costs.cells,
+            limit=int(options.share * self.mesh.num_cells),
+            min_quality=options.min_quality,
+            boundary=options.boundary,
+        )
+        self.collapsed = self.mesh.num_vertices - change.mesh.num_vertices
+        self.predicted -= _cost_of(costs, self.mesh, change)
+        self._carry_edges(change)
+        self._apply(change)
+
+    def bisect(self, target: int, options: Exchange) -> None:
+        """Bisect the most promising edges until there are as many cells as wanted."""
+        topology = self.mesh.topology
+        ends = topology.edges.long()
+        positions = self.mesh.vertices
+        length = torch.linalg.vector_norm(positions[ends[:, 1]] - positions[ends[:, 0]], dim=1)
+        cells = torch.bincount(cell_edges(topology).view(-1), minlength=ends.shape[0])
+        allowed = long_edges(self.mesh, options.long) & (self.gain > 0)
+        budget = max(0, target - self.mesh.num_cells)
+        # Gain per new cell; long edges come first, which keeps shapes good.
+        chosen = independent_edges(self.mesh, self.gain / cells * length, allowed, budget)
+        change = bisect_edges(self.mesh, chosen)
+        done = find_edges(topology, change.parents[change.is_new].long())
+        surplus = torch.zeros((change.mesh.num_vertices, 4), dtype=self.surplus.dtype, device=self.surplus.device)
+        surplus[change.is_new] = options.start * self.surplus[done]
+        # Of a quadratic model's whole decrease, a part s of the best step wins s (2 - s).
+        self.predicted += options.start * (2.0 - options.start) * float(self.gain[done].sum())
+        self.bisected = len(done)
+        self.surplus = surplus
+        self._apply(change)
+
+    def refinement(self) -> Refinement | None:
+        """What came of it."""
+        if not self.flipped + self.collapsed + self.bisected:
+            return None
+        return Refinement(self.changes, self.surplus, self.collapsed, self.bisected, self.flipped, self.predicted)
+
+    def _price_of_a_cell(self, options: Exchange) -> float:
+        """Gain per new cell of the last bisection among the best that one round can pay for."""
+        cells = torch.bincount(cell_edges(self.mesh.topology).view(-1), minlength=len(self.gain))
+        gain, order = (self.gain / cells).sort(descending=True)
+        affordable = cells[order].cumsum(0) <= max(1.0, options.share * self.mesh.num_cells)
+        return float(gain[max(0, int(affordable.sum()) - 1)])
+
+    def _apply(self, change: MeshChange) -> None:
+        self.changes.append(change)
+        self.values = change.carry(self.values)
+        self.mesh = change.mesh
+
+    def _carry_edges(self, change: MeshChange) -> None:
+        """What was predicted for an edge holds while its cells are the same."""
+        before = edges_before(self.mesh.topology, change)
+        before[cell_edges(change.mesh.topology)[_changed_cells(self.mesh, change)].view(-1).long()] = -1
+        self.gain = torch.where(before >= 0, self.gain[before], 0.0)
+        self.surplus = self.surplus[before]
+
+
+def _changed_cells(mesh: TetMesh, change: MeshChange) -> torch.Tensor:
+    """Cells after a change that adds no vertices which have other corners than before."""
+    before = mesh.tets[change.cell_parents.long()]
+    after = change.parents[:, 0][change.mesh.tets.long()]
+    return true_indices((before != after).any(1))
+
+
+def _cost_of(costs: CollapseCosts, mesh: TetMesh, change: MeshChange) -> float:
+    """Sum of the predicted costs of the collapses that a change has made."""
+    cells = _changed_cells(mesh, change)
+    before = mesh.tets[change.cell_parents[cells].long()].long()
+    after = change.parents[:, 0][change.mesh.tets[cells].long()].long()
+    moved = before != after
+    pairs = torch.unique(torch.stack((before[moved], after[moved]), 1), dim=0)
+    kept = pairs[:, 1]
+    edges = find_edges(mesh.topology, pairs)
+    by_half_edge = torch.full(
+        (2 * mesh.topology.edges.shape[0],), torch.nan, dtype=costs.cost.dtype, device=kept.device
+    )
+    by_half_edge[2 * costs.edges + costs.target] = costs.cost
+    return float(by_half_edge[2 * edges + (mesh.topology.edges[edges, 1] == kept)].sum())

@@ -1,0 +1,178 @@
+"""What changes of the mesh would do to the squared error of its images, predicted one by one.
+
+Everywhere, values are (V, 4) parameters of the vertices: linear RGB in [0, 1] and density >= 0, in the unit that the
+derivatives are for.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from difftetvr.mesh.arrays import chunks, true_indices
+from difftetvr.mesh.change import MeshChange
+from difftetvr.mesh.flips import FOUR_TO_FOUR, TWO_TO_THREE, Flips
+from difftetvr.mesh.incidence import cell_edges, cell_faces, find_edges, stars
+from difftetvr.mesh.tetmesh import TetMesh
+from difftetvr.mesh.topology import Topology
+from difftetvr.render.gauss_newton import HatDerivatives, ImageModel
+
+_CELLS_OF_VERTEX = 24
+_DAMPING = 0.01
+
+
+@dataclass(frozen=True)
+class BisectionGains:
+    """What bisecting each edge would win.
+
+    Attributes:
+        gain: (E,) predicted decrease of the error with the best values at the new vertex.
+        surplus: (E, 4) these values, minus the mean of the edge's ends.
+    """
+
+    gain: torch.Tensor
+    surplus: torch.Tensor
+
+
+def bisection_gains(mesh: TetMesh, values: torch.Tensor, edges: HatDerivatives) -> BisectionGains:
+    """Predicts what bisecting each edge would win.
+
+    Args:
+        mesh: The mesh.
+        values: (V, 4) parameters.
+        edges: Derivatives by the hats of ``mesh.topology.edges``.
+    """
+    ends = mesh.topology.edges.long()
+    middle = values[ends].mean(1)
+    upper = torch.cat((1.0 - middle[:, :3], torch.full_like(middle[:, 3:], torch.inf)), 1)
+    surplus = edges.best_step(-middle, upper, _DAMPING)
+    return BisectionGains(edges.decrease(surplus).clamp_min(0.0), surplus)
+
+
+@dataclass(frozen=True)
+class CollapseCosts:
+    """Candidates for half-edge collapses, and what each of them would cost.
+
+    Attributes:
+        edges: (C,) indices into ``topology.edges``.
+        target: (C,) which end stays, 0 or 1.
+        cost: (C,) predicted increase of the error.
+        cells: (C,) cells that vanish.
+    """
+
+    edges: torch.Tensor
+    target: torch.Tensor
+    cost: torch.Tensor
+    cells: torch.Tensor
+
+
+def collapse_costs(mesh: TetMesh, values: torch.Tensor, vertices: HatDerivatives, share: float) -> CollapseCosts:
+    """Predicts what merging vertices into their neighbours would cost.
+
+    After a collapse the removed vertex's place has the value that the cells which fill its star interpolate there. The
+    cost is that of giving the vertex this value. Only vertices that are cheap by a first estimate are looked at: the
+    cost of giving them the mean of their neighbours.
+
+    Args:
+        mesh: The mesh.
+        values: (V, 4) parameters.
+        vertices: Derivatives by the vertices' hats.
+        share: Share of the vertices to look at, in (0, 1].
+    """
+    edges = mesh.topology.edges.long()
+    estimate = -vertices.decrease(_neighbour_mean(edges, values) - values)
+    count = max(1, min(len(values), round(share * len(values))))
+    looked_at = torch.zeros(len(values), dtype=torch.bool, device=values.device)
+    looked_at[torch.topk(estimate, count, largest=False).indices] = True
+    candidates = [true_indices(looked_at[edges[:, 1 - target]]) for target in (0, 1)]
+    rows = torch.cat(candidates)
+    target = torch.repeat_interleave(torch.tensor([len(c) for c in candidates], device=rows.device))
+    kept = edges[rows].gather(1, target[:, None])[:, 0]
+    removed = edges[rows].sum(1) - kept
+    after = torch.full((len(rows), 4), torch.nan, dtype=values.dtype, device=values.device)
+    for part in chunks(len(rows), rows.device, width=_CELLS_OF_VERTEX):
+        after[part] = _value_after(mesh, values, removed[part], kept[part])
+    cost = -vertices[removed].decrease(after - values[removed])
+    found = true_indices(torch.isfinite(cost))
+    cells = torch.bincount(cell_edges(mesh.topology).view(-1), minlength=edges.shape[0])
+    return CollapseCosts(rows[found], target[found], cost[found], cells[rows[found]])
+
+
+def _neighbour_mean(edges: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+    sums, counts = torch.zeros_like(values), torch.zeros_like(values[:, 0])
+    for one, other in ((0, 1), (1, 0)):
+        sums.index_add_(0, edges[:, one], values[edges[:, other]])
+        counts += torch.bincount(edges[:, one], minlength=len(values))
+    return sums / counts.clamp_min(1.0)[:, None]
+
+
+def _value_after(mesh: TetMesh, values: torch.Tensor, removed: torch.Tensor, kept: torch.Tensor) -> torch.Tensor:
+    """(N, 4) values at the places of removed vertices once they are merged into kept ones; NaN where none is found."""
+    owner, cells = stars(mesh.topology, removed)
+    tets = mesh.tets[cells].long()
+    rows = true_indices(~(tets == kept[owner, None]).any(1))
+    owner, tets = owner[rows], tets[rows]
+    # The face opposite the removed vertex, with the kept one as the new cell's apex.
+    face = tets[tets != removed[owner, None]].view(-1, 3)
+    positions = mesh.vertices.detach().double()
+    apex = positions[kept[owner]]
+    a, b, c = (positions[face[:, k]] - apex for k in range(3))
+    place = positions[removed[owner]] - apex
+    normals = (torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b))
+    volume = (a * normals[0]).sum(1, keepdim=True)
+    weights = torch.stack([(place * normal).sum(1) for normal in normals], 1) / volume
+    weights = torch.cat((weights, 1.0 - weights.sum(1, keepdim=True)), 1)
+    least = torch.nan_to_num(weights.amin(1), -torch.inf, -torch.inf, -torch.inf)
+    best = torch.full((len(removed),), -torch.inf, dtype=torch.float64, device=values.device)
+    best.scatter_reduce_(0, owner, least, "amax")
+    holds = true_indices((least == best[owner]) & (least > -1e-6))
+    corners = torch.cat((face[holds], kept[owner[holds], None]), 1)
+    after = torch.full((len(removed), 4), torch.nan, dtype=values.dtype, device=values.device)
+    after[owner[holds]] = (weights[holds].to(values.dtype)[:, :, None] * values[corners]).sum(1)
+    return after
+
+
+def flip_gains(flips: Flips, values: torch.Tensor, model: ImageModel) -> torch.Tensor:
+    """Predicts what flips would win.
+
+    A flip changes the field by a surplus where what vanishes and what appears cross, falling to 0 at the outer faces of
+    its cells. The gain is that of the hat of the face or edge that vanishes, whose peak is in its centre.
+
+    Args:
+        flips: Flips of the mesh that the model is of.
+        values: (V, 4) parameters.
+        model: Derivatives.
+
+    Returns:
+        (N,) predicted decrease of the error.
+    """
+    topology, surplus = flips.mesh.topology, flips.surplus(values)
+    gain = torch.zeros_like(surplus[:, 0])
+    by_face = true_indices(flips.kind == TWO_TO_THREE)
+    first = flips.cells[by_face, 0].long()
+    corners = topology.tets[first]
+    # The vanishing face lies opposite the end of the new edge that is a corner of the first cell.
+    opposite = (corners[:, :, None] == flips.edge[by_face, None, :]).any(2).int().argmax(1)
+    faces = cell_faces(topology)[first, opposite].long()
+    gain[by_face] = model.faces[faces].decrease(surplus[by_face])
+    by_edge = true_indices(flips.kind != TWO_TO_THREE)
+    is_ring = (flips.kind[by_edge] == FOUR_TO_FOUR)[:, None]
+    ends = torch.where(is_ring, flips.ring[by_edge][:, [0, 2]], flips.edge[by_edge])
+    gain[by_edge] = model.edges[find_edges(topology, ends.long())].decrease(surplus[by_edge])
+    return gain
+
+
+def edges_before(topology: Topology, change: MeshChange) -> torch.Tensor:
+    """Which edges of the mesh before a change those after it are.
+
+    Args:
+        topology: Cells before the change.
+        change: The change.
+
+    Returns:
+        (E',) int64 indices into ``topology.edges`` for each of ``change.mesh.topology.edges``; -1 for new ones.
+    """
+    ends = change.mesh.topology.edges.long()
+    old = change.parents[:, 0].long()[ends]
+    return torch.where(change.is_new[ends].any(1), -1, find_edges(topology, old))

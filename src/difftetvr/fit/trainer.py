@@ -1,0 +1,337 @@
+"""One reconstruction between two iterations, and what an iteration does."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import astuple
+from functools import reduce
+from operator import add
+from typing import TYPE_CHECKING
+
+import torch
+
+from difftetvr.backend import default_device, get_backend
+from difftetvr.capture.capture import Capture
+from difftetvr.errors import CaptureError
+from difftetvr.fit.checkpoint import Checkpoint, describe_capture, require_same_capture
+from difftetvr.fit.config import FitConfig, grid_cubes
+from difftetvr.fit.errors import FitError
+from difftetvr.fit.evaluation import evaluate, rendered_image, true_image
+from difftetvr.fit.history import History, MoveTotals, RefinementRecord
+from difftetvr.fit.losses import LOSSES
+from difftetvr.fit.metrics import psnr_of_mse
+from difftetvr.fit.parameters import FieldParameters
+from difftetvr.fit.positions import StepReport, VertexOptimizer
+from difftetvr.fit.refinement import Moment, Refinement, Situation, Strategy
+from difftetvr.fit.result import Progress
+from difftetvr.mesh.tetmesh import TetMesh
+from difftetvr.render import render
+from difftetvr.render.gauss_newton import ImageModel, model_image
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+_GLANCE_VIEWS = 4
+_POSITIONS = "positions."  # prefix of the positions' state in a checkpoint
+
+
+class Trainer:
+    """A reconstruction between two iterations; its state alone decides how it goes on.
+
+    Attributes:
+        capture: Images and cameras.
+        config: Options.
+        strategy: How the mesh is refined; None: not at all.
+        budget: Cells that the mesh may have.
+        parameters: Colours and densities under optimisation.
+        positions: Vertex positions under optimisation; None where they are fixed.
+        iteration: Iterations done.
+        history: What happened so far.
+    """
+
+    def __init__(
+        self, capture: Capture, config: FitConfig, mesh: TetMesh | None = None, strategy: Strategy | None = None
+    ) -> None:
+        """Prepares the first iteration.
+
+        Args:
+            capture: Images and cameras.
+            config: Options.
+            mesh: Mesh to begin with; default: the grid that the options ask for.
+            strategy: How to refine it; default: as the options say.
+
+        Raises:
+            CaptureError: The background needs alpha that the capture lacks.
+            FitError: The device does not exist.
+        """
+        require_fittable(capture, config)
+        self.capture = capture
+        self.config = config
+        self.strategy = strategy or config.strategy()
+        self._mesh = (mesh or build_grid(capture, config, self.strategy)).to(device=resolve_device(config.device))
+        self.budget = self._budget(mesh is not None or config.grid is not None)
+        self.parameters = FieldParameters(self._mesh, config, capture.density_unit)
+        self.positions = VertexOptimizer(self._mesh, config.motion) if config.move else None
+        self.iteration = 0
+        self.history = History()
+        self._train_views: list[int] = capture.train_indices.tolist()
+        self._capture_description = describe_capture(capture)
+
+    @property
+    def mesh(self) -> TetMesh:
+        """The mesh as it is now, detached."""
+        mesh = self.positions.mesh if self.positions else self._mesh
+        return mesh.with_vertices(mesh.vertices.detach())
+
+    def step(self) -> None:
+        """One iteration: refines the mesh where that is due, renders views, moves parameters and vertices.
+
+        Raises:
+            FitError: The loss is not finite.
+        """
+        self._refine_if_due()
+        rate = self._motion_rate()
+        mesh = self.positions.mesh if self.positions and rate is not None else self.mesh
+        self.parameters.zero_grad()
+        batch = self.config.views_at(self.iteration, len(self._train_views))
+        background = self.config.background_at(self.iteration)
+        losses, errors = [], []
+        for position in batch:
+            loss, error = self._accumulate(mesh, self._train_views[position], background, 1.0 / len(batch))
+            losses.append(loss)
+            errors.append(error)
+        if not all(math.isfinite(loss) for loss in losses):
+            raise FitError(
+                f"The loss of iteration {self.iteration} is not finite; check the images or lower the learning rate."
+            )
+        self.parameters.step(self.config.rate_at(self.iteration), self.config.haze_penalty)
+        self._move(rate)
+        self.history.loss.append(sum(losses) / len(losses))
+        self.history.psnr.append(psnr_of_mse(sum(errors) / len(errors)))
+        self.iteration += 1
+
+    def glance(self) -> None:
+        """Notes the mean PSNR over a few held-out views, for the curves; decides nothing."""
+        tested = self.capture.test_indices.tolist()
+        views = tested[:: max(1, math.ceil(len(tested) / _GLANCE_VIEWS))]
+        seen = evaluate(
+            self.mesh, self.parameters.detached_field(), self.capture, views, self.config.evaluation_background()
+        ).mean_psnr
+        if seen is not None:
+            self.history.evaluations.append((self.iteration, seen))
+
+    def checkpoint(self) -> Checkpoint:
+        """The state, to be saved."""
+        tensors = {"vertices": self.mesh.vertices, "tets": self.mesh.tets, **self.parameters.state()}
+        if self.positions:
+            state = self.positions.state()
+            tensors |= {_POSITIONS + name: tensor for name, tensor in state.items() if name not in tensors}
+        return Checkpoint(self.iteration, self.config, self._capture_description, tensors, self.budget, self.history)
+
+    @staticmethod
+    def resume(
+        capture: Capture, config: FitConfig, checkpoint: Checkpoint, strategy: Strategy | None = None
+    ) -> Trainer:
+        """Goes on from a checkpoint.
+
+        Raises:
+            FitError: The checkpoint is of a run with other options or images, or lacks something.
+        """
+        checkpoint.config.require_same_run(config)
+        trainer = Trainer(capture, config, checkpoint.mesh(), strategy)
+        require_same_capture(checkpoint.capture, trainer._capture_description)
+        checkpoint.require_tensors_like(trainer.checkpoint().tensors)
+        trainer.parameters.restore(checkpoint.tensors)
+        if trainer.positions:
+            trainer.positions.restore({k.removeprefix(_POSITIONS): v for k, v in checkpoint.tensors.items()})
+        trainer.budget = checkpoint.budget
+        trainer.iteration = checkpoint.iteration
+        trainer.history = checkpoint.history
+        return trainer
+
+    def progress(self, seconds: float) -> Progress:
+        """A summary for a display; loss and PSNR are means over the last pass through the training views."""
+        window = self._epoch
+        losses, psnrs = self.history.loss[-window:], self.history.psnr[-window:]
+        return Progress(
+            iteration=self.iteration,
+            iterations=self.config.iterations,
+            loss=sum(losses) / max(1, len(losses)),
+            train_psnr=sum(psnrs) / max(1, len(psnrs)),
+            held_out_psnr=self.history.evaluations[-1][1] if self.history.evaluations else None,
+            cells=self.mesh.num_cells,
+            moves=self.history.moves,
+            refinements=len(self.history.refinements),
+            last_refinement=self.history.refinements[-1] if self.history.refinements else None,
+            seconds=seconds,
+        )
+
+    @property
+    def _epoch(self) -> int:
+        """Iterations of one pass over the training views."""
+        return max(1, len(self._train_views) // self.config.batch_views)
+
+    def _budget(self, mesh_is_given: bool) -> int:
+        """The options' cells; a given mesh is its own budget, unless the strategy is to make it grow."""
+        if not mesh_is_given:
+            return self.config.cells
+        grows = self.strategy is not None and self.strategy.initial_cells(self.config.cells) < self.config.cells
+        return max(self.config.cells if grows else 0, self._mesh.num_cells)
+
+    def _moment(self) -> Moment:
+        return Moment(self.iteration, self.config.iterations, self._epoch, self.mesh.num_cells, self.budget)
+
+    def _motion_rate(self) -> float | None:
+        """Rate of the vertices' steps, None where they stay."""
+        held = self.strategy is not None and not self.strategy.lets_move(self._moment())
+        return None if held else self.config.motion_rate_at(self.iteration)
+
+    def _move(self, rate: float | None) -> None:
+        if self.positions is None:
+            return
+        if rate is None:
+            self.positions.zero_grad()
+        elif (self.iteration + 1) % self.config.motion.every == 0:
+            self.history.moves = _added(self.history.moves, self.positions.step(rate))
+
+    def _refine_if_due(self) -> None:
+        if self.strategy is None or not self.strategy.is_due(self._moment()):
+            return
+        count = len(self._train_views)
+        positions = self.config.refinement_views_at(self.iteration, self.strategy.views, count)
+        views = [self._train_views[position] for position in positions]
+        mesh = self.mesh
+        refinement = self.strategy.refine(
+            Situation(mesh, self.parameters.values(), self._moment(), lambda: self._model(views), self._color_gradients)
+        )
+        if refinement is None:
+            return
+        before = self._error(views)
+        self._apply(refinement)
+        self.history.refinements.append(
+            RefinementRecord(
+                iteration=self.iteration,
+                cells_before=mesh.num_cells,
+                cells=self.mesh.num_cells,
+                vertices=self.mesh.num_vertices,
+                collapsed=refinement.collapsed,
+                bisected=refinement.bisected,
+                flipped=refinement.flipped,
+                predicted=refinement.predicted,
+                error_before=before,
+                error_after=self._error(views),
+            )
+        )
+
+    def _apply(self, refinement: Refinement) -> None:
+        for change in refinement.changes:
+            self.parameters.carry(change)
+            if self.positions:
+                self.positions.carry(change)
+            self._mesh = change.mesh
+        if refinement.surplus is not None:
+            self.parameters.add(refinement.surplus)
+
+    def _model(self, views: Sequence[int]) -> ImageModel:
+        """Mean over views of the quadratic models of the squared error, in the parameters' units."""
+        field = self.parameters.detached_field()
+        background = self.config.background_at(self.iteration)
+        deterministic = self.config.deterministic
+        models = (
+            model_image(
+                self.mesh,
+                field,
+                self.capture.cameras[view],
+                true_image(self.capture, view, background),
+                background,
+                deterministic=deterministic,
+            )
+            for view in views
+        )
+        return reduce(add, models).scaled(1.0 / len(views)).with_density_unit(self.parameters.density_unit)
+
+    def _error(self, views: Sequence[int]) -> float:
+        """Mean squared error over views."""
+        field = self.parameters.detached_field()
+        background = self.config.background_at(self.iteration)
+        errors = []
+        for view in views:
+            image = rendered_image(self.mesh, field, self.capture, view, background)
+            errors.append(float((image - true_image(self.capture, view, background)).square().mean()))
+        return sum(errors) / len(errors)
+
+    def _color_gradients(self) -> torch.Tensor:
+        """(V,) sums over all training views of the absolute derivatives of the loss by the vertices' colours."""
+        background = self.config.background_at(self.iteration)
+        total = torch.zeros_like(self.parameters.density, requires_grad=False)
+        for view in self._train_views:
+            self.parameters.zero_grad()
+            self._accumulate(self.mesh, view, background, 1.0)
+            gradient = self.parameters.color.grad
+            if gradient is not None:
+                total += gradient.abs().sum(1)
+        return total
+
+    def _accumulate(
+        self, mesh: TetMesh, view: int, background: tuple[float, float, float], weight: float
+    ) -> tuple[float, float]:
+        """Adds a view's gradient; returns its loss and mean squared error."""
+        device = mesh.vertices.device
+        truth = true_image(self.capture, view, background).to(device)
+        image = render(
+            mesh,
+            self.parameters.field(),
+            self.capture.cameras[view],
+            background=torch.tensor(background, device=device),
+            deterministic=self.config.deterministic,
+        ).color
+        loss = LOSSES[self.config.loss](image, truth)
+        (weight * loss).backward()
+        return float(loss.detach()), float((image.detach() - truth).square().mean())
+
+
+def _added(totals: MoveTotals, report: StepReport) -> MoveTotals:
+    return MoveTotals(*(a + b for a, b in zip(astuple(totals), (1, *astuple(report)), strict=True)))
+
+
+def require_fittable(capture: Capture, config: FitConfig) -> None:
+    """Checks what can be known before the first iteration.
+
+    Raises:
+        CaptureError: The images have no alpha but the background needs it.
+        FitError: The device does not exist.
+        BackendError: No back end works, or the device has none.
+    """
+    if config.needs_alpha and capture.alphas is None:
+        raise CaptureError(
+            f"The images of '{capture.name}' have no alpha, which the background {config.background} needs; "
+            "use background black."
+        )
+    resolve_device(config.device)
+
+
+def build_grid(capture: Capture, config: FitConfig, strategy: Strategy | None) -> TetMesh:
+    """The Kuhn grid over the capture's bounds that the options ask for."""
+    lower, upper = capture.bounds.tolist()
+    extent = [b - a for a, b in zip(lower, upper, strict=True)]
+    cells = strategy.initial_cells(config.cells) if strategy else config.cells
+    return TetMesh.grid(config.grid or grid_cubes(cells, extent), lower, upper)
+
+
+def resolve_device(name: str | None) -> torch.device:
+    """The device of that name, the best that works for None.
+
+    Raises:
+        FitError: There is no such device here.
+        BackendError: It has no back end, or its back end does not work.
+    """
+    if name is None:
+        return default_device()
+    try:
+        device = torch.device(name)
+        torch.empty(1, device=device)
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        reason = str(error).splitlines()[0].rstrip(".")
+        raise FitError(f"The device '{name}' cannot be used ({reason}); use cpu, cuda or mps.") from error
+    get_backend(name)
+    return device

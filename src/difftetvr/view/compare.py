@@ -1,0 +1,78 @@
+"""Truth beside several models: held-out views with PSNR, and cuts through the meshes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from PIL import Image, ImageOps
+
+from difftetvr.capture.capture import Capture
+from difftetvr.errors import CaptureError
+from difftetvr.fit.evaluation import rendered_image, true_image
+from difftetvr.fit.metrics import psnr
+from difftetvr.mesh.field import Field
+from difftetvr.mesh.tetmesh import TetMesh
+from difftetvr.view.cut import Plane, cut_picture
+from difftetvr.view.pictures import below, beside, labelled, to_picture
+
+_PANEL = 384  # least pixels of a panel's side
+
+
+@dataclass(frozen=True)
+class Model:
+    """A reconstruction with a name to be shown."""
+
+    name: str
+    mesh: TetMesh
+    field: Field
+
+
+def compare_models(capture: Capture, models: list[Model], rows: int = 1, plane: Plane | None = None) -> Image.Image:
+    """Draws truth | model | model ... for held-out views over black, labelled with the PSNR of the view.
+
+    Args:
+        capture: Cameras and true images.
+        models: What to show; at least one.
+        rows: Views, evenly spread over those held out.
+        plane: Adds a row of cuts along it through every model; the last one's is shown without cells, too. None: none.
+
+    Raises:
+        CaptureError: The capture holds out no views, or rows is less than 1.
+        MeshError: The plane misses a mesh.
+    """
+    tested = capture.test_indices.tolist()
+    if not tested or rows < 1:
+        raise CaptureError(
+            f"'{capture.name}' holds out {len(tested)} views and {rows} are to be shown; show at least 1."
+        )
+    count = min(rows, len(tested))
+    sheet = [_view_row(capture, models, tested[i * len(tested) // count]) for i in range(count)]
+    if plane is not None:
+        sheet.append(_cut_row(models, plane))
+    return below(sheet)
+
+
+def _view_row(capture: Capture, models: list[Model], view: int) -> Image.Image:
+    truth = true_image(capture, view)
+    panels = [_panel(to_picture(truth), f"truth, held-out view {view}")]
+    for model in models:
+        image = rendered_image(model.mesh, model.field, capture, view)
+        panels.append(_panel(to_picture(image), f"{model.name}, {psnr(image, truth):.2f} dB"))
+    return beside(panels)
+
+
+def _cut_row(models: list[Model], plane: Plane) -> Image.Image:
+    last = models[-1]
+    panels = [_cut(last, plane, f"cut, {last.name}", outlines=False)]
+    return beside(panels + [_cut(m, plane, f"cut, {m.name}, {m.mesh.num_cells:,} cells") for m in models])
+
+
+def _cut(model: Model, plane: Plane, label: str, outlines: bool = True) -> Image.Image:
+    picture = cut_picture(model.mesh, model.field, plane, _PANEL, outlines)
+    return _panel(ImageOps.pad(picture, (_PANEL, _PANEL), color="black"), label)
+
+
+def _panel(picture: Image.Image, label: str) -> Image.Image:
+    enlargement = max(1, -(-_PANEL // min(picture.size)))
+    size = (picture.width * enlargement, picture.height * enlargement)
+    return labelled(picture.resize(size, Image.Resampling.NEAREST), label)

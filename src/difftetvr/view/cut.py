@@ -1,0 +1,174 @@
+"""A cut through a mesh: what it holds there, and where its cells are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from PIL import Image, ImageDraw
+
+from difftetvr.errors import MeshError
+from difftetvr.mesh.field import Field
+from difftetvr.mesh.tetmesh import TetMesh
+from difftetvr.mesh.topology import LOCAL_EDGES
+
+_SMOOTHING = 2  # lines are drawn so many times larger, and shrunk
+_LINE = (255, 255, 255)
+_LINE_STRENGTH = 0.45
+_ASIDE = 1e-6 * 0.7548776662  # planes through vertices are moved by this part of the mesh's size: no cell is cut badly
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A plane to cut along.
+
+    Attributes:
+        normal: (3,) direction that looks at the viewer, of any length but 0.
+        origin: (3,) a point of the plane; the centre of the mesh if None.
+    """
+
+    normal: tuple[float, float, float] = (1.0, 0.0, 0.0)
+    origin: tuple[float, float, float] | None = None
+
+    def axes(self) -> np.ndarray:
+        """(3, 3) unit vectors: to the right and upwards in the picture, and the normal.
+
+        Raises:
+            MeshError: The normal is no direction.
+        """
+        normal = np.asarray(self.normal, dtype=np.float64)
+        length = np.linalg.norm(normal)
+        if not (np.isfinite(length) and length > 0):
+            raise MeshError(f"The normal of the cut is {self.normal}; pass a direction other than 0.")
+        normal = normal / length
+        up = np.eye(3)[2 if abs(normal[2]) < 0.9 else 1]
+        right = np.cross(up, normal)
+        right /= np.linalg.norm(right)
+        return np.stack((right, np.cross(normal, right), normal))
+
+
+@dataclass(frozen=True)
+class _Section:
+    """Triangles (N, 3, 2) in the plane with colours (N, 3, 3), and outlines (M, 2, 2) of the cells' sections."""
+
+    triangles: np.ndarray
+    colors: np.ndarray
+    outlines: np.ndarray
+
+
+def cut_picture(
+    mesh: TetMesh, field: Field, plane: Plane | None = None, size: int = 512, outlines: bool = True
+) -> Image.Image:
+    """Draws a cut through a mesh: its colours as a slab looks that is a twentieth of the mesh thick, and its cells.
+
+    Args:
+        mesh: The mesh.
+        field: Its colours and densities.
+        plane: Where to cut; default: through the centre, seen along x.
+        size: Pixels of the picture's longer side.
+        outlines: Whether to draw the cells.
+
+    Raises:
+        MeshError: The plane misses the mesh, or its normal is no direction.
+    """
+    section = _section(mesh, field, plane or Plane())
+    points = section.outlines.reshape(-1, 2)
+    lower, extent = points.min(0), np.ptp(points, axis=0)
+    scale = (size - 1) / extent.max()
+    width, height = (max(1, round(float(side * scale)) + 1) for side in extent)
+
+    def to_pixels(place: np.ndarray) -> np.ndarray:
+        place = (place - lower) * scale
+        return np.stack((place[..., 0], height - 1 - place[..., 1]), -1)
+
+    pixels = _fill(to_pixels(section.triangles), section.colors, width, height)
+    picture = Image.fromarray((255.0 * pixels.clip(0, 1)).round().astype(np.uint8))
+    return _with_outlines(picture, to_pixels(section.outlines)) if outlines else picture
+
+
+def _section(mesh: TetMesh, field: Field, plane: Plane) -> _Section:
+    positions = mesh.vertices.detach().double().cpu().numpy()
+    center = 0.5 * (positions.min(0) + positions.max(0))
+    size = float(np.linalg.norm(np.ptp(positions, axis=0)))
+    right, up, normal = plane.axes()
+    origin = center if plane.origin is None else np.asarray(plane.origin)
+    height = (positions - origin) @ normal + _ASIDE * size
+    tets = mesh.tets.cpu().numpy()
+    above = height[tets] > 0
+    cut = np.flatnonzero(above.any(1) & ~above.all(1))
+    if not len(cut):
+        raise MeshError(f"The plane at {tuple(origin.tolist())} misses the mesh; move it into the mesh's bounds.")
+    colors = _slab_colors(mesh, field, size / 20.0)
+    per_cell = field.location_on(mesh) == "cell"
+
+    places, shades, owners = [], [], []
+    for i, j in LOCAL_EDGES:
+        crossed = cut[above[cut, i] != above[cut, j]]
+        one, other = tets[crossed, i], tets[crossed, j]
+        share = (height[one] / (height[one] - height[other]))[:, None]
+        place = (1 - share) * positions[one] + share * positions[other]
+        places.append(np.stack(((place - origin) @ right, (place - origin) @ up), 1))
+        shades.append(colors[crossed] if per_cell else (1 - share) * colors[one] + share * colors[other])
+        owners.append(crossed)
+    return _polygons(np.concatenate(places), np.concatenate(shades), np.concatenate(owners))
+
+
+def _polygons(places: np.ndarray, shades: np.ndarray, owners: np.ndarray) -> _Section:
+    """Corners of the cells' sections, three or four a cell, sorted around their centres and cut into triangles."""
+    _, cell, counts = np.unique(owners, return_inverse=True, return_counts=True)
+    centers = np.stack([np.bincount(cell, column) for column in places.T], 1) / counts[:, None]
+    offset = places - centers[cell]
+    order = np.lexsort((np.arctan2(offset[:, 1], offset[:, 0]), cell))
+    first = np.cumsum(counts) - counts
+    three, four = first[counts == 3], first[counts == 4]
+    corners = np.concatenate(
+        [np.stack([s, s + 1, s + 2], 1) for s in (three, four)] + [np.stack([four, four + 2, four + 3], 1)]
+    )
+    following = np.arange(len(order)) + 1
+    following[np.cumsum(counts) - 1] = first
+    places, shades = places[order], shades[order]
+    return _Section(places[corners], shades[corners], np.stack((places, places[following]), 1))
+
+
+def _slab_colors(mesh: TetMesh, field: Field, thickness: float) -> np.ndarray:
+    """Premultiplied colour of a slab of constant colour and density."""
+    opacity = -torch.expm1(-field.density.detach().double() * thickness)
+    return (field.color.detach().double() * opacity[:, None]).cpu().numpy()
+
+
+def _fill(triangles: np.ndarray, colors: np.ndarray, width: int, height: int) -> np.ndarray:
+    """(H, W, 3) image of triangles with linear colours; black where there are none."""
+    low = np.maximum(np.floor(triangles.min(1)).astype(int), 0)
+    high = np.minimum(np.ceil(triangles.max(1)).astype(int), (width - 1, height - 1))
+    spans = np.maximum(high - low + 1, 0)
+    counts = spans.prod(1)
+    owner = np.repeat(np.arange(len(triangles)), counts)
+    place = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
+    x = low[owner, 0] + place % spans[owner, 0]
+    y = low[owner, 1] + place // spans[owner, 0]
+    a, b, c = triangles.transpose(1, 0, 2)
+    area = _cross(b - a, c - a)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        point = np.stack((x, y), 1) - a[owner]
+        second = _cross(point, (c - a)[owner]) / area[owner]
+        third = _cross((b - a)[owner], point) / area[owner]
+    # A hair more than the triangle, so that no pixel between two neighbours stays black.
+    inside = (second >= -1e-9) & (third >= -1e-9) & (second + third <= 1 + 1e-9)
+    weights = np.stack((1 - second - third, second, third), 1)[inside]
+    image = np.zeros((height, width, 3))
+    image[y[inside], x[inside]] = (weights[:, :, None] * colors[owner[inside]]).sum(1)
+    return image
+
+
+def _cross(p: np.ndarray, q: np.ndarray) -> np.ndarray:
+    return p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]
+
+
+def _with_outlines(picture: Image.Image, outlines: np.ndarray) -> Image.Image:
+    mask = Image.new("L", (_SMOOTHING * picture.width, _SMOOTHING * picture.height), 0)
+    draw = ImageDraw.Draw(mask)
+    for start, end in (_SMOOTHING * outlines).tolist():
+        draw.line((*start, *end), fill=round(255 * _LINE_STRENGTH))
+    mask = mask.resize(picture.size, Image.Resampling.BOX)
+    return Image.composite(Image.new("RGB", picture.size, _LINE), picture, mask)
