@@ -19,8 +19,12 @@ setup:
 	@sh scripts/setup.sh
 
 demo: setup
-	$(BIN)/difftetvr fit tooth -o out/demo --cells 80000 --overwrite
-	@echo 'Pictures (truth | reconstruction | difference) and curves lie in out/demo; model.vtu there opens in ParaView.'
+	$(BIN)/difftetvr fit tooth -o out/demo/uniform --cells 39780 --no-move --refine none --iterations 1000 --overwrite
+	$(BIN)/difftetvr fit tooth -o out/demo --cells 39780 --overwrite
+	$(BIN)/difftetvr compare tooth out/demo/uniform/model.vtu out/demo/model.vtu -o out/demo/demo.png \
+	    --names 'uniform grid' 'adaptive mesh'
+	@echo 'out/demo/demo.png shows the truth, a uniform grid and an adaptive mesh of as many cells, and cuts through them;'
+	@echo 'out/demo/model.vtu opens in ParaView.'
 
 test: lint
 	$(BIN)/python -m pytest -q --durations=10

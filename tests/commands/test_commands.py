@@ -68,6 +68,20 @@ def test_render_frames_the_mesh(run, tmp_path, capsys):
     assert np.asarray(Image.open(picture)).reshape(-1, 3).tolist() == [[0, 255, 0]] * 64
 
 
+def test_compare_and_cut_draw_pictures(run, tmp_path, capsys):
+    model, sheet, cut = str(run / "model.vtu"), tmp_path / "sheet.png", tmp_path / "cut.png"
+    assert cli.main(["compare", "tooth", model, model, "-o", str(sheet), "--names", "one", "other", *VIEWS]) == 0
+    assert Image.open(sheet).width > 3 * 384
+    assert cli.main(["cut", model, "-o", str(cut), "--size", "100", "--normal", "0", "1", "0", "--no-cells"]) == 0
+    assert max(Image.open(cut).size) == 100
+    assert "2 models but 1 --names" in fails(capsys, "compare", "tooth", model, model, "-o", sheet, "--names", "x")
+    assert "no model" in fails(capsys, "compare", "tooth", "-o", sheet)
+    assert "misses the mesh" in fails(capsys, "cut", model, "-o", cut, "--origin", 9, 9, 9)
+    assert "--size is 1" in fails(capsys, "cut", model, "-o", cut, "--size", 1)
+    fails(capsys, "cut", model, "-o", tmp_path / "cut.jpg")
+    fails(capsys, "compare", "tooth", tmp_path / "nothing.vtu", "-o", sheet)
+
+
 def test_info_describes_meshes_and_captures(run, tmp_path, capsys):
     assert cli.main(["info", str(run / "model.vtu")]) == 0
     assert "per vertex" in capsys.readouterr().out

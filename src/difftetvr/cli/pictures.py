@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 # Where the default camera stands, seen from the mesh: in front, to the right, a little above.
 _DEFAULT_DIRECTION = (0.45, -1.0, 0.35)
+_MOST_PIXELS = 16384  # of a cut's side
 
 
 @dataclass(frozen=True)
@@ -154,6 +155,8 @@ class Cut:
 
         require_png(self.output)
         require_writable(self.output, CaptureError)
+        if not 2 <= self.size <= _MOST_PIXELS:
+            raise CaptureError(f"--size is {self.size}; it must lie between 2 and {_MOST_PIXELS}.")
         mesh, field_on_mesh = load(self.model)
         picture = cut_picture(mesh, field_on_mesh, Plane(self.normal, self.origin), self.size, not self.no_cells)
         save_picture(self.output, picture)

@@ -8,7 +8,7 @@ from PIL import Image, ImageOps
 
 from difftetvr.capture.capture import Capture
 from difftetvr.errors import CaptureError
-from difftetvr.fit.evaluation import rendered_image, true_image
+from difftetvr.fit.evaluation import evaluate, rendered_image, true_image
 from difftetvr.fit.metrics import psnr
 from difftetvr.mesh.field import Field
 from difftetvr.mesh.tetmesh import TetMesh
@@ -28,7 +28,7 @@ class Model:
 
 
 def compare_models(capture: Capture, models: list[Model], rows: int = 1, plane: Plane | None = None) -> Image.Image:
-    """Draws truth | model | model ... for held-out views over black, labelled with the PSNR of the view.
+    """Draws truth | model | model ... for held-out views over black, labelled with the PSNR of this and of all views.
 
     Args:
         capture: Cameras and true images.
@@ -46,18 +46,20 @@ def compare_models(capture: Capture, models: list[Model], rows: int = 1, plane: 
             f"'{capture.name}' holds out {len(tested)} views and {rows} are to be shown; show at least 1."
         )
     count = min(rows, len(tested))
-    sheet = [_view_row(capture, models, tested[i * len(tested) // count]) for i in range(count)]
+    means = [evaluate(model.mesh, model.field, capture, tested).mean_psnr or 0.0 for model in models]
+    sheet = [_view_row(capture, models, means, tested[i * len(tested) // count]) for i in range(count)]
     if plane is not None:
         sheet.append(_cut_row(models, plane))
     return below(sheet)
 
 
-def _view_row(capture: Capture, models: list[Model], view: int) -> Image.Image:
+def _view_row(capture: Capture, models: list[Model], means: list[float], view: int) -> Image.Image:
     truth = true_image(capture, view)
     panels = [_panel(to_picture(truth), f"truth, held-out view {view}")]
-    for model in models:
+    for model, mean in zip(models, means, strict=True):
         image = rendered_image(model.mesh, model.field, capture, view)
-        panels.append(_panel(to_picture(image), f"{model.name}, {psnr(image, truth):.2f} dB"))
+        label = f"{model.name}, {psnr(image, truth):.2f} dB (all views {mean:.2f})"
+        panels.append(_panel(to_picture(image), label))
     return beside(panels)
 
 
