@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Literal
 
 import torch
@@ -73,38 +74,54 @@ def collapse_edges(
         raise MeshError(f"Edges, target and cost have shapes {shapes}; pass three times (C,).")
     if torch.isnan(cost).any():
         raise MeshError("The cost is NaN somewhere; pass real numbers, and inf for what should come last.")
-    ends = mesh.topology.edges[check_indices(edges, mesh.topology.edges.shape[0], "edge")]
-    kept = ends.gather(1, check_indices(target, 2, "target")[:, None])
-    half_edges = torch.cat((ends.sum(1, keepdim=True, dtype=ends.dtype) - kept, kept), 1)
-    movable = true_indices(_movable(mesh, half_edges, boundary, coplanarity))
-    queue = half_edges[movable[best_first(-cost.detach()[movable])]]
-    return _apply(mesh, _without_twins(mesh, _choose(mesh, queue, limit, min_quality)))
-
-
-def _movable(mesh: TetMesh, half_edges: torch.Tensor, boundary: str, coplanarity: float) -> torch.Tensor:
-    """(C,) bool: which collapses [v, u] leave the boundary as it is, whatever they do to cells."""
     if boundary not in ("fixed", "slide") or not 0 <= coplanarity < 1:
         raise MeshError(
             f"The boundary is {boundary!r} with a coplanarity of {coplanarity}; pass 'fixed' or 'slide' and a number "
             "of at least 0 and below 1."
         )
+    edges = check_indices(edges, mesh.topology.edges.shape[0], "edge")
+    target = check_indices(target, 2, "target")
     outer = boundary_vertices(mesh.topology)
-    movable = ~outer[half_edges[:, 0].long()]
-    if boundary == "slide":
-        sliding = true_indices(~movable & outer[half_edges[:, 1].long()])
-        movable[sliding] = keeps_surface(mesh, half_edges[sliding], coplanarity)
-    return movable
+
+    def half_edges(places: torch.Tensor) -> torch.Tensor:
+        """(N, 2) int32, [vertex to remove, vertex to keep] of those that leave the boundary as it is."""
+        ends = mesh.topology.edges[edges[places]]
+        kept = ends.gather(1, target[places, None])
+        removed = ends.sum(1, keepdim=True, dtype=ends.dtype) - kept
+        pairs = torch.cat((removed, kept), 1)
+        movable = ~outer[pairs[:, 0].long()]
+        if boundary == "slide":
+            sliding = true_indices(~movable & outer[pairs[:, 1].long()])
+            movable[sliding] = keeps_surface(mesh, pairs[sliding], coplanarity)
+        return pairs[movable]
+
+    queue = best_first(-cost.detach())
+    return _apply(mesh, _without_twins(mesh, _choose(mesh, queue, half_edges, limit, min_quality)))
 
 
-def _choose(mesh: TetMesh, queue: torch.Tensor, limit: int | None, min_quality: float) -> torch.Tensor:
-    """Collapses (N, 2), [vertex to remove, vertex to keep], that are valid, independent and within the limit."""
+def _choose(
+    mesh: TetMesh,
+    queue: torch.Tensor,
+    half_edges: Callable[[torch.Tensor], torch.Tensor],
+    limit: int | None,
+    min_quality: float,
+) -> torch.Tensor:
+    """Collapses (N, 2), [vertex to remove, vertex to keep], that are valid, independent and within the limit.
+
+    Args:
+        mesh: The mesh.
+        queue: (C,) int64 numbers of the candidates, best first.
+        half_edges: Gives the collapses (N, 2) of candidates, without those that would change the boundary.
+        limit: See `collapse_edges`.
+        min_quality: See `collapse_edges`.
+    """
     blocked = torch.zeros(mesh.num_vertices, dtype=torch.bool, device=queue.device)
-    chosen, vanished, within = [queue[:0]], 0, True
+    chosen, vanished, within = [half_edges(queue[:0])], 0, True
     # With a limit the head of the queue is enough; it grows until the limit is reached.
     batch = queue.shape[0] if limit is None else _SMALLEST_BATCH + limit // _CELLS_PER_COLLAPSE
     while queue.shape[0] and within:
         head, queue = queue[:batch], queue[batch:]
-        taken, counts = _choose_among(mesh, head, blocked, min_quality)
+        taken, counts = _choose_among(mesh, half_edges(head), blocked, min_quality)
         if limit is not None:
             fits = counts.cumsum(0) <= limit - vanished
             within = bool(fits.all())
