@@ -81,6 +81,24 @@ class BoundaryConstraint:
         return move.index_copy(0, self.vertices, kept)
 
 
+def removable_vertices(mesh: TetMesh, slide: bool, tolerance: float = 1e-4) -> torch.Tensor:
+    """Vertices whose removal may leave the boundary as it is: inner ones, and those that could slide along it.
+
+    Args:
+        mesh: Any valid mesh.
+        slide: Whether those on the boundary count.
+        tolerance: See `BoundaryConstraint.sliding`.
+
+    Returns:
+        (V,) bool.
+    """
+    removable = ~boundary_vertices(mesh.topology)
+    if slide:
+        constraint = BoundaryConstraint.sliding(mesh, tolerance)
+        removable[constraint.vertices] = constraint.tangents.flatten(1).any(1)
+    return removable
+
+
 def keeps_surface(mesh: TetMesh, half_edges: torch.Tensor, tolerance: float = 1e-4) -> torch.Tensor:
     """Whether the boundary stays the same surface where one of its vertices v is merged into its neighbour u.
 

@@ -67,10 +67,13 @@ class HatDerivatives:
         Returns:
             (N,), negative where the error grows.
         """
+        return -(self.gradient * step).sum(1) - 0.5 * self.curvature(step)
+
+    def curvature(self, step: torch.Tensor) -> torch.Tensor:
+        """(N,) second derivatives of the error along steps (N, 4): <s, H s>."""
         color, density = step[:, :3], step[:, 3]
-        curved = self.emission * color.square().sum(1) + self.absorption * density.square()
         mixed = density * (self.coupling * color).sum(1)
-        return -(self.gradient * step).sum(1) - 0.5 * curved - mixed
+        return self.emission * color.square().sum(1) + self.absorption * density.square() + 2.0 * mixed
 
     def best_step(self, lower: torch.Tensor, upper: torch.Tensor, damping: float = 0.0) -> torch.Tensor:
         """The step of each hat alone that minimises its model between bounds.

@@ -47,7 +47,7 @@ def compare_models(capture: Capture, models: list[Model], rows: int = 1, plane: 
         )
     count = min(rows, len(tested))
     means = [evaluate(model.mesh, model.field, capture, tested).mean_psnr or 0.0 for model in models]
-    sheet = [_view_row(capture, models, means, tested[i * len(tested) // count]) for i in range(count)]
+    sheet = [_view_row(capture, models, means, tested[(2 * i + 1) * len(tested) // (2 * count)]) for i in range(count)]
     if plane is not None:
         sheet.append(_cut_row(models, plane))
     return below(sheet)

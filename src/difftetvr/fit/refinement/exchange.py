@@ -18,6 +18,7 @@ from difftetvr.fit.refinement.gains import (
 from difftetvr.fit.refinement.strategy import Moment, Refinement, Situation
 from difftetvr.mesh.arrays import true_indices
 from difftetvr.mesh.bisection import bisect_edges, independent_edges, long_edges
+from difftetvr.mesh.boundary import removable_vertices
 from difftetvr.mesh.change import MeshChange
 from difftetvr.mesh.collapse import collapse_edges
 from difftetvr.mesh.flip_search import find_flips
@@ -26,7 +27,7 @@ from difftetvr.mesh.incidence import cell_edges, find_edges
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.render.gauss_newton import ImageModel
 
-_LOOKED_AT = 4.0
+_LOOKED_AT = 5.0
 """Vertices whose collapse is priced, in units of those that may vanish."""
 
 
@@ -139,7 +140,8 @@ class _Exchange:
     def collapse(self, model: ImageModel, options: Exchange) -> None:
         """Take the cheapest cells away."""
         share = min(1.0, _LOOKED_AT * options.share)
-        costs = collapse_costs(self.mesh, self.values, model.vertices, share)
+        removable = removable_vertices(self.mesh, slide=options.boundary == "slide")
+        costs = collapse_costs(self.mesh, self.values, model.vertices, removable, share)
         change = collapse_edges(
             self.mesh,
             costs.edges,

@@ -20,6 +20,7 @@ from difftetvr.render.gauss_newton import HatDerivatives, ImageModel
 
 _CELLS_OF_VERTEX = 24
 _DAMPING = 0.01
+_ON_A_FACE = 1e-6  # so far outside of a cell, in barycentric coordinates, a point still counts as inside
 
 
 @dataclass(frozen=True)
@@ -67,22 +68,27 @@ class CollapseCosts:
     cells: torch.Tensor
 
 
-def collapse_costs(mesh: TetMesh, values: torch.Tensor, vertices: HatDerivatives, share: float) -> CollapseCosts:
+def collapse_costs(
+    mesh: TetMesh, values: torch.Tensor, vertices: HatDerivatives, removable: torch.Tensor, share: float
+) -> CollapseCosts:
     """Predicts what merging vertices into their neighbours would cost.
 
     After a collapse the removed vertex's place has the value that the cells which fill its star interpolate there. The
-    cost is that of giving the vertex this value. Only vertices that are cheap by a first estimate are looked at: the
-    cost of giving them the mean of their neighbours.
+    cost is that of giving the vertex this value, and of the bends between these cells. The error's slope is left out:
+    what a collapse would win by it, a better value of the vertex wins as well. Only vertices that are cheap by a first
+    estimate are looked at: the cost of giving them the mean of their neighbours.
 
     Args:
         mesh: The mesh.
         values: (V, 4) parameters.
         vertices: Derivatives by the vertices' hats.
-        share: Share of the vertices to look at, in (0, 1].
+        removable: (V,) bool, which vertices may go at all.
+        share: Share of all vertices to look at, in (0, 1].
     """
     edges = mesh.topology.edges.long()
-    estimate = -vertices.decrease(_neighbour_mean(edges, values) - values)
-    count = max(1, min(len(values), round(share * len(values))))
+    estimate = vertices.curvature(_neighbour_mean(edges, values) - values)
+    estimate = torch.where(removable, estimate, torch.inf)
+    count = min(int(removable.sum()), max(1, round(share * len(values))))
     looked_at = torch.zeros(len(values), dtype=torch.bool, device=values.device)
     looked_at[torch.topk(estimate, count, largest=False).indices] = True
     candidates = [true_indices(looked_at[edges[:, 1 - target]]) for target in (0, 1)]
@@ -90,10 +96,9 @@ def collapse_costs(mesh: TetMesh, values: torch.Tensor, vertices: HatDerivatives
     target = torch.repeat_interleave(torch.tensor([len(c) for c in candidates], device=rows.device))
     kept = edges[rows].gather(1, target[:, None])[:, 0]
     removed = edges[rows].sum(1) - kept
-    after = torch.full((len(rows), 4), torch.nan, dtype=values.dtype, device=values.device)
+    cost = torch.empty(len(rows), dtype=values.dtype, device=values.device)
     for part in chunks(len(rows), rows.device, width=_CELLS_OF_VERTEX):
-        after[part] = _value_after(mesh, values, removed[part], kept[part])
-    cost = -vertices[removed].decrease(after - values[removed])
+        cost[part] = _cost(mesh, values, vertices[removed[part]], removed[part], kept[part])
     found = true_indices(torch.isfinite(cost))
     cells = torch.bincount(cell_edges(mesh.topology).view(-1), minlength=edges.shape[0])
     return CollapseCosts(rows[found], target[found], cost[found], cells[rows[found]])
@@ -107,30 +112,50 @@ def _neighbour_mean(edges: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
     return sums / counts.clamp_min(1.0)[:, None]
 
 
-def _value_after(mesh: TetMesh, values: torch.Tensor, removed: torch.Tensor, kept: torch.Tensor) -> torch.Tensor:
-    """(N, 4) values at the places of removed vertices once they are merged into kept ones; NaN where none is found."""
+def _cost(
+    mesh: TetMesh, values: torch.Tensor, hats: HatDerivatives, removed: torch.Tensor, kept: torch.Tensor
+) -> torch.Tensor:
+    """(N,) cost of merging `removed` into `kept`, whose `hats` are those of the removed ones; NaN where impossible."""
     owner, cells = stars(mesh.topology, removed)
     tets = mesh.tets[cells].long()
     rows = true_indices(~(tets == kept[owner, None]).any(1))
     owner, tets = owner[rows], tets[rows]
-    # The face opposite the removed vertex, with the kept one as the new cell's apex.
-    face = tets[tets != removed[owner, None]].view(-1, 3)
-    positions = mesh.vertices.detach().double()
-    apex = positions[kept[owner]]
-    a, b, c = (positions[face[:, k]] - apex for k in range(3))
-    place = positions[removed[owner]] - apex
-    normals = (torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b))
-    volume = (a * normals[0]).sum(1, keepdim=True)
-    weights = torch.stack([(place * normal).sum(1) for normal in normals], 1) / volume
-    weights = torch.cat((weights, 1.0 - weights.sum(1, keepdim=True)), 1)
+    # A new cell has the face opposite the removed vertex, and the kept one as its apex.
+    corners = torch.cat((tets[tets != removed[owner, None]].view(-1, 3), kept[owner, None]), 1)
+    weights, volume = _barycentric(mesh.vertices.detach().double(), corners, removed[owner])
+    # What each new cell's linear function is at the removed vertex's place; only the one that holds it shows it there.
+    extrapolated = (weights.to(values.dtype)[:, :, None] * values[corners]).sum(1)
     least = torch.nan_to_num(weights.amin(1), -torch.inf, -torch.inf, -torch.inf)
     best = torch.full((len(removed),), -torch.inf, dtype=torch.float64, device=values.device)
     best.scatter_reduce_(0, owner, least, "amax")
-    holds = true_indices((least == best[owner]) & (least > -1e-6))
-    corners = torch.cat((face[holds], kept[owner[holds], None]), 1)
+    holds = true_indices((least == best[owner]) & (least > -_ON_A_FACE))
     after = torch.full((len(removed), 4), torch.nan, dtype=values.dtype, device=values.device)
-    after[owner[holds]] = (weights[holds].to(values.dtype)[:, :, None] * values[corners]).sum(1)
-    return after
+    after[owner[holds]] = extrapolated[holds]
+
+    # The old and the new cell at a face overlap down to this share of the way to the apex. There, the other new cells
+    # differ from what the hat explains by how much their functions differ, seen from the removed vertex's place.
+    sides, towards_apex = weights[:, :3], weights[:, 3]
+    reach = 1.0 / (towards_apex + 3.0 * sides.amax(1).clamp_min(0.0)).clamp_min(_ON_A_FACE)
+    deviation = torch.minimum(reach, 1.0 / towards_apex.clamp_min(_ON_A_FACE)).to(values.dtype)[:, None] * (
+        extrapolated - after[owner]
+    )
+    bends = hats[owner].curvature(deviation) * volume.to(values.dtype)
+    total = torch.zeros_like(hats.emission).index_add_(0, owner, volume.to(values.dtype))
+    bent = torch.zeros_like(total).index_add_(0, owner, bends) / total
+    return 0.5 * (bent + hats.curvature(after - values[removed]))
+
+
+def _barycentric(
+    positions: torch.Tensor, corners: torch.Tensor, vertices: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Coordinates (N, 4) of vertices (N,) in tetrahedra (N, 4), and the tetrahedra's volumes (N,) times six."""
+    apex = positions[corners[:, 3]]
+    a, b, c = (positions[corners[:, k]] - apex for k in range(3))
+    place = positions[vertices] - apex
+    normals = (torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b))
+    volume = (a * normals[0]).sum(1)
+    weights = torch.stack([(place * normal).sum(1) for normal in normals], 1) / volume[:, None]
+    return torch.cat((weights, 1.0 - weights.sum(1, keepdim=True)), 1), volume.abs()
 
 
 def flip_gains(flips: Flips, values: torch.Tensor, model: ImageModel) -> torch.Tensor:
