@@ -16,7 +16,7 @@ import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from rich.table import Table
-from tooth_runs import KUHN_CELLS, METHODS, Run, captures, results_of
+from tooth_runs import KUHN_CELLS, METHODS, Run, captures, results_of, version
 
 import difftetvr as dtv
 from difftetvr.fit import softplus_regularizer
@@ -46,7 +46,7 @@ class ArticleRun:
 
     def key(self) -> str:
         """What tells it from all others."""
-        return json.dumps([ITERATIONS, asdict(self)])
+        return json.dumps([version(), ITERATIONS, asdict(self)])
 
 
 def measure(run: ArticleRun) -> dict[str, Any]:
@@ -105,7 +105,7 @@ def sweep(name: str, values: list[float], **fixed: Any) -> list[ArticleRun]:
 
 
 def figure8(processes: int) -> Table:
-    rates = [1e-6, 5e-6, 1e-5, 1e-4, 3e-4, 1e-3, 3e-3]
+    rates = [1e-6, 5e-6, 1e-5, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2]
     sweeps = {
         "rate of colours": ("color_rate", sweep("color_rate", [0.005, 0.01, 0.03, 0.06, 0.08, 0.1, 0.2])),
         "rate of positions, no guard": ("position_rate", sweep("position_rate", rates)),

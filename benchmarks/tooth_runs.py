@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
-from collections.abc import Callable, Iterable
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -22,7 +24,7 @@ from difftetvr.fit.refinement import Exchange, Grow, Star
 STUDY = Path("out/study")
 VALIDATION_VIEWS = 16
 KUHN_CELLS = {"5 k": 4992, "20 k": 19656, "79 k": 79002, "303 k": 302940}
-"""Cells of the standard grids; every method gets exactly as many."""
+"""Cells of the standard grids, and the budget of every method."""
 
 METHODS: dict[str, dict[str, Any]] = {
     "uniform": {"refine": "none", "move": False, "iterations": 1000},
@@ -58,7 +60,7 @@ class Run:
 
     def key(self) -> str:
         """What tells it from all others."""
-        return json.dumps([self.size, self.config().to_json()], sort_keys=True)
+        return json.dumps([version(), self.size, self.config().to_json()], sort_keys=True)
 
 
 @cache
@@ -110,18 +112,34 @@ def results_of(
     """
     STUDY.mkdir(parents=True, exist_ok=True)
     path = STUDY / f"{study}.jsonl"
-    known = {}
-    if path.exists():
-        known = {result["key"]: result for result in map(json.loads, path.read_text().splitlines())}
+    known = dict(_known(path))
     runs = list(runs)
     missing = {run.key(): run for run in runs if run.key() not in known}
     with ProcessPoolExecutor(processes) as pool:
-        for result in pool.map(make, missing.values()):
+        for done in as_completed([pool.submit(make, run) for run in missing.values()]):
+            result = done.result()
             known[result["key"]] = result
             with path.open("a") as file:
                 file.write(json.dumps(result) + "\n")
             print(f"  {result['name']}: {result['psnr']:.2f} dB held out, {result['seconds']:.0f} s", flush=True)
     return [known[run.key()] for run in runs]
+
+
+def _known(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Results of a file by key; a last line that a kill has cut short is left out."""
+    for line in path.read_text().splitlines() if path.exists() else ():
+        with suppress(json.JSONDecodeError):
+            result = json.loads(line)
+            yield result["key"], result
+
+
+@cache
+def version() -> str:
+    """What tells this state of the package from others: results of other code are of no use."""
+    digest = hashlib.sha256()
+    for file in sorted(Path(dtv.__file__).parent.rglob("*.py")):
+        digest.update(file.read_bytes())
+    return digest.hexdigest()[:12]
 
 
 def spread(values: list[float]) -> str:

@@ -1,6 +1,7 @@
 """Runs that move and refine: they learn more, stay valid, and go on after a kill at any moment."""
 
 import dataclasses
+import importlib
 
 import pytest
 import torch
@@ -122,23 +123,77 @@ class BisectFirst:
 
     def refine(self, situation):
         change = bisect_edges(situation.mesh, torch.tensor([0]))
-        return Refinement([change], bisected=1)
+        return Refinement([change])
 
 
 def test_strategies_of_ones_own(small_capture, tmp_path):
     result = fit(small_capture, SHORT, strategy=BisectFirst())
     (record,) = result.history.refinements
-    assert (record.iteration, record.bisected, record.predicted) == (3, 1, None)
+    assert (record.iteration, record.added, record.predicted) == (3, 1, None)
     assert result.history.moves.steps == 2
     assert result.mesh.num_vertices == Trainer(small_capture, SHORT).mesh.num_vertices + 1
 
 
-def test_refinement_needs_colours_on_vertices():
+def test_resuming_with_another_strategy_is_refused(small_capture, tmp_path):
+    path = tmp_path / "c.safetensors"
+    fit(small_capture, SHORT, strategy=BisectFirst(), checkpoint=path)
+    with pytest.raises(FitError, match="refines its mesh by BisectFirst, not Exchange"):
+        fit(small_capture, SHORT, checkpoint=path, resume=True)
+
+
+@pytest.mark.parametrize("refine", ["exchange", "grow", "star"])
+def test_meshes_in_double_precision_and_with_unused_vertices(small_capture, refine):
+    lower, upper = small_capture.bounds.tolist()
+    mesh = TetMesh.grid((4, 4, 6), lower, upper, dtype=torch.float64)
+    spare = torch.rand(50, 3, dtype=torch.float64) * 0.1
+    mesh = TetMesh(torch.cat((mesh.vertices, spare)), mesh.tets)
+    result = fit(small_capture, dataclasses.replace(config_for(refine), cells=800), mesh=mesh)
+    assert result.mesh.vertices.dtype == torch.float64
+    assert result.history.refinements[0].added > 0
+    assert result.mesh.num_cells <= 800
+    TetMesh(result.mesh.vertices, result.mesh.tets)
+
+
+def test_a_mesh_given_to_grow_never_shrinks(small_capture):
+    config = dataclasses.replace(SHORT, cells=700, refine="grow", grid=(4, 4, 6))
+    cells = [record.cells for record in fit(small_capture, config).history.refinements]
+    assert min(cells) >= 0.97 * 576
+    assert 0.95 * 700 < cells[-1] <= 700
+
+
+def test_flips_alone_keep_the_budget(small_capture):
+    config = dataclasses.replace(SHORT, exchange=Exchange(share=0.0, rounds=8, views=3))
+    for record in fit(small_capture, config).history.refinements:
+        assert record.cells <= 700
+
+
+def test_a_device_without_double_precision_is_one_sentence(small_capture, monkeypatch):
+    trainer = importlib.import_module("difftetvr.fit.trainer")
+    monkeypatch.setattr(trainer, "_WITHOUT_DOUBLES", ("cpu",))
+    with pytest.raises(FitError, match=r"double precision, which cpu lacks; use the device cpu, or neither move"):
+        Trainer(small_capture, SHORT)
+    Trainer(small_capture, dataclasses.replace(SHORT, move=False, refine="none"))
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("refine", ["exchange", "grow", "star"])
+def test_cuda_moves_and_refines_like_the_cpu(small_capture, refine):
+    config = dataclasses.replace(SHORT, refine=refine)
+    cpu, cuda = fit(small_capture, config), fit(small_capture, dataclasses.replace(config, device="cuda"))
+    assert len(cpu.history.refinements) == len(cuda.history.refinements)
+    assert cuda.metrics["psnr"] == pytest.approx(cpu.metrics["psnr"], abs=0.5)
+    TetMesh(cuda.mesh.vertices, cuda.mesh.tets)
+
+
+def test_refinement_needs_colours_on_vertices(small_capture):
     with pytest.raises(
         FitError, match=r"^The option refine is exchange; it must be none where colours belong to cells"
     ):
         FitConfig(location="cell")
-    assert FitConfig(location="cell", refine="none").strategy() is None
+    per_cell = FitConfig(location="cell", refine="none", device="cpu")
+    assert per_cell.strategy() is None
+    with pytest.raises(FitError, match="field on cells cannot be refined"):
+        Trainer(small_capture, per_cell, strategy=Star())
 
 
 def test_options_survive_json_with_their_parts():

@@ -108,7 +108,7 @@ def test_star_takes_the_largest_gradients_within_the_budget(scene):
     count = round(0.05 * mesh.num_vertices)
     split = change.parents[change.is_new]
     assert (split >= mesh.num_vertices - count).any(1).all(), "gradients grow with the vertices' indices"
-    assert refinement.bisected == int(change.is_new.sum())
+    assert refinement.added == int(change.is_new.sum()) and refinement.removed == 0
     room = mesh.num_cells + (change.mesh.num_cells - mesh.num_cells) // 2
     fewer = Star(share=0.05).refine(situation_of(scene, budget=room))
     assert mesh.num_cells < fewer.changes[0].mesh.num_cells <= room
@@ -207,7 +207,7 @@ def test_bisections_win_what_is_predicted(scene):
     achieved = 0.0
     for edge in best.tolist():
         change = bisect_edges(mesh, torch.tensor([edge]))
-        finer = change.carry(values) + change.is_new[:, None] * gains.surplus[edge]
+        finer = change.carry(values) + change.is_new[:, None] * gains.start[edge]
         assert ((finer[:, :3] >= -1e-12) & (finer[:, :3] <= 1 + 1e-12)).all() and (finer[:, 3] >= -1e-12).all()
         won = before - error_of(change.mesh, finer.clamp_min(0.0), truth)
         assert won > 0
@@ -235,18 +235,17 @@ def test_edges_before_a_change(scene):
 )
 def test_an_exchange_lowers_the_error_and_keeps_the_budget(scene, strategy):
     mesh, values, truth, _ = scene
-    budget = mesh.num_cells if strategy.initial == 1.0 else 2 * mesh.num_cells
+    budget = mesh.num_cells if strategy.initial == 1.0 else round(1.05 * mesh.num_cells)
     situation = situation_of(scene, budget, iteration=860)
     refinement = strategy.refine(situation)
     changed = refinement.changes[-1].mesh
     TetMesh(changed.vertices, changed.tets)
     target = strategy.target(situation.moment)
-    assert 0.97 * target <= changed.num_cells <= target or strategy.flips
-    assert changed.num_cells <= 1.02 * target
+    assert 0.97 * target <= changed.num_cells <= target
     new_values = applied(values, refinement)
     assert ((new_values[:, :3] >= -1e-12) & (new_values[:, :3] <= 1 + 1e-12)).all()
     assert (new_values[:, 3] >= -1e-12).all()
-    assert (refinement.surplus != 0).any(1).sum() <= refinement.bisected
+    assert (refinement.surplus != 0).any(1).sum() <= refinement.added
     if strategy.boundary == "fixed" and strategy.share:
         kept = set(refinement.changes[0].parents[:, 0].tolist())
         assert set(mesh.topology.boundary_faces.unique().tolist()) <= kept
@@ -254,7 +253,7 @@ def test_an_exchange_lowers_the_error_and_keeps_the_budget(scene, strategy):
     assert achieved > 0
     assert 0.4 < achieved / refinement.predicted < 1.5
     assert (refinement.flipped > 0) == strategy.flips
-    assert (refinement.collapsed > 0) == (strategy.share > 0)
+    assert (refinement.removed > 0) == (strategy.share > 0)
 
 
 @pytest.mark.parametrize(

@@ -130,11 +130,33 @@ def test_progress_draws_a_bar_on_a_terminal():
     assert "50/100" in console.export_text()
 
 
+@pytest.mark.parametrize("width", [80, 120])
+def test_a_terminal_shows_gains_and_the_time_left(width):
+    console = Console(width=width, record=True, force_terminal=True, file=open("/dev/null", "w"))  # noqa: SIM115
+    record = RefinementRecord(100, 12000, 12345, 2000, 70, 80, 5, 3e-4, 2e-3, 1.8e-3)
+    with ProgressDisplay(console) as display:
+        display(status(iteration=1000, iterations=2400, refinements=3))
+        display(
+            status(
+                iteration=1001,
+                iterations=2400,
+                held_out_psnr=30.0,
+                moves=MoveTotals(50, 9000, 3, 2, 1234),
+                refinements=4,
+                last_refinement=record,
+            )
+        )
+    text = console.export_text()
+    for expected in ("left", "12,345 cells", "refinement 4: -70 +80 vertices", "(predicted 3.0e-04)"):
+        assert expected in text
+
+
 def test_progress_tells_of_moves_and_refinements():
     console = Console(width=60, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
     record = RefinementRecord(100, 12000, 12345, 2000, 70, 80, 5, 3e-4, 2e-3, 1.8e-3)
     with ProgressDisplay(console) as display:
-        display(status(moves=MoveTotals(50, 9000, 3, 2, 1), refinements=4, last_refinement=record))
+        display(status(refinements=3))
+        display(status(iteration=3, moves=MoveTotals(50, 9000, 3, 2, 1), refinements=4, last_refinement=record))
     text = console.export_text()
     for expected in (
         "1 moves refused",

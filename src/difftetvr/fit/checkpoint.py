@@ -40,6 +40,7 @@ class Checkpoint:
         capture: What :func:`describe_capture` says about the images it runs on.
         tensors: Mesh, parameters and optimiser state by name.
         budget: Cells that the mesh may have.
+        strategy: Name of the refinement strategy's class.
         history: Losses and timings up to here.
         source: What to call it in messages; the file that it was read from.
     """
@@ -49,6 +50,7 @@ class Checkpoint:
     capture: dict[str, Any]
     tensors: dict[str, torch.Tensor]
     budget: int
+    strategy: str
     history: History
     source: str = field(default="checkpoint", compare=False)
 
@@ -64,6 +66,7 @@ class Checkpoint:
             "config": self.config.to_json(),
             "capture": self.capture,
             "budget": self.budget,
+            "strategy": self.strategy,
             **self.history.events(),
         }
         tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in self.tensors.items()}
@@ -113,6 +116,21 @@ class Checkpoint:
         except (KeyError, MeshError) as error:
             raise _unreadable(self.source, _reason(error)) from error
 
+    def require_strategy(self, current: str) -> None:
+        """Checks that the run goes on with the kind of strategy that it began with.
+
+        Args:
+            current: Name of the strategy's class.
+
+        Raises:
+            FitError: It was another.
+        """
+        if current != self.strategy:
+            raise FitError(
+                f"The saved run refines its mesh by {self.strategy}, not {current}; resume with the same strategy or "
+                "start anew."
+            )
+
     def require_tensors_like(self, expected: dict[str, torch.Tensor]) -> None:
         """Checks that the tensors are those that the run needs.
 
@@ -154,7 +172,8 @@ def _checkpoint(state: dict[str, Any], tensors: dict[str, torch.Tensor], source:
         raise ValueError(f"its history has {len(loss)} losses after {iteration} iterations")
     if not isinstance(capture, dict):
         raise TypeError("it does not describe its images")
-    return Checkpoint(iteration, config, capture, tensors, int(state["budget"]), history, source)
+    budget, strategy = int(state["budget"]), str(state["strategy"])
+    return Checkpoint(iteration, config, capture, tensors, budget, strategy, history, source)
 
 
 def _checksum(state: str, tensors: dict[str, torch.Tensor]) -> str:

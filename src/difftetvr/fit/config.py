@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from difftetvr.fit.errors import FitError
-from difftetvr.fit.options import options_from_json, require
+from difftetvr.fit.options import LARGEST_COUNT, options_from_json, require
 from difftetvr.fit.positions import VertexOptimizerConfig
 from difftetvr.fit.refinement import Exchange, Grow, Star, Strategy
 from difftetvr.mesh.faces import MAX_CELLS
@@ -22,14 +22,13 @@ _CELLS_PER_CUBE = 6
 # Independent streams of random numbers.
 _VIEW_STREAM, _BACKGROUND_STREAM, _REFINEMENT_STREAM = range(3)
 _BACKGROUND_COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
-_LARGEST_COUNT = 2**31 - 1
 # Least and greatest value of options that count something.
 _RANGES = {
     "cells": (1, MAX_CELLS),
-    "iterations": (1, _LARGEST_COUNT),
-    "batch_views": (1, _LARGEST_COUNT),
-    "evaluate_every": (0, _LARGEST_COUNT),
-    "seed": (0, _LARGEST_COUNT),
+    "iterations": (1, LARGEST_COUNT),
+    "batch_views": (1, LARGEST_COUNT),
+    "evaluate_every": (0, LARGEST_COUNT),
+    "seed": (0, LARGEST_COUNT),
 }
 _STRATEGIES = ("exchange", "grow", "star", "none")
 # Options that change nothing about where the optimisation goes: a resumed run may choose them anew.
@@ -38,7 +37,7 @@ _FREE_OPTIONS = frozenset({"device", "evaluate_every", "checkpoint_seconds"})
 
 @dataclass(frozen=True)
 class Motion(VertexOptimizerConfig):
-    """How vertices move."""
+    """How vertices move in a run; unlike `VertexOptimizer` alone, it lets those on the boundary slide by default."""
 
     boundary: Literal["fixed", "slide"] = "slide"
     """Whether vertices on the boundary stay, or slide in their plane or along their crease."""
@@ -49,7 +48,7 @@ class Motion(VertexOptimizerConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(self.every >= 1, "every", self.every, "at least 1")
+        require(1 <= self.every <= LARGEST_COUNT, "every", self.every, f"at least 1 and at most {LARGEST_COUNT}")
         require(0 < self.until <= 1, "until", self.until, "greater than 0 and at most 1")
 
 
@@ -64,7 +63,8 @@ class FitConfig:
     """
 
     cells: int = 20_000
-    """Budget of tetrahedra. The run begins with a grid of near-cubic cubes over the capture's bounds."""
+    """Budget of tetrahedra. The run begins with the grid of near-cubic cubes over the capture's bounds that is nearest
+    to it, and refinement ends within it."""
     grid: tuple[int, int, int] | None = None
     """Cubes of that grid along x, y and z, 6 tetrahedra each; overrides --cells, unless the mesh is to grow."""
     move: bool = True
@@ -95,7 +95,7 @@ class FitConfig:
     initial_density: float = 0.05
     """Density that all vertices start with, in units of the capture's density."""
     seed: int = 0
-    """Seed of the order of the views and of random backgrounds."""
+    """Seed of the order of the views, of those that refinements are judged on, and of random backgrounds."""
     deterministic: bool = True
     """Repeatable to the last bit on one machine, also across --resume; on CPUs the backward pass then runs on one
     thread. False is faster on many cores."""

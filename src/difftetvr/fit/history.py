@@ -18,8 +18,8 @@ class RefinementRecord:
         cells_before: Cells before it.
         cells: Cells after it.
         vertices: Vertices after it.
-        collapsed: Vertices removed.
-        bisected: Vertices added.
+        removed: Vertices taken away.
+        added: Vertices made.
         flipped: Flips made.
         predicted: Predicted decrease of the mean squared error of some training views; None where a strategy predicts
             nothing.
@@ -31,8 +31,8 @@ class RefinementRecord:
     cells_before: int
     cells: int
     vertices: int
-    collapsed: int
-    bisected: int
+    removed: int
+    added: int
     flipped: int
     predicted: float | None
     error_before: float

@@ -9,6 +9,9 @@ from typing import Any, Literal, TypeVar
 
 from difftetvr.fit.errors import FitError
 
+LARGEST_COUNT = 2**31 - 1
+"""Greatest value of options that count something."""
+
 _Options = TypeVar("_Options")
 
 

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 _GLANCE_VIEWS = 4
+_WITHOUT_DOUBLES = ("mps",)
 _POSITIONS = "positions."  # prefix of the positions' state in a checkpoint
 
 
@@ -62,13 +63,14 @@ class Trainer:
 
         Raises:
             CaptureError: The background needs alpha that the capture lacks.
-            FitError: The device does not exist.
+            FitError: The device does not exist or cannot move vertices, or a strategy would refine a field on cells.
         """
-        require_fittable(capture, config)
+        strategy = strategy or config.strategy()
+        require_fittable(capture, config, strategy)
         self.capture = capture
         self.config = config
-        self.strategy = strategy or config.strategy()
-        self._mesh = (mesh or build_grid(capture, config, self.strategy)).to(device=resolve_device(config.device))
+        self.strategy = strategy
+        self._mesh = (mesh or build_grid(capture, config, self.strategy)).to(device=_device_of(config, strategy))
         self.budget = self._budget(mesh is not None or config.grid is not None)
         self.parameters = FieldParameters(self._mesh, config, capture.density_unit)
         self.positions = VertexOptimizer(self._mesh, config.motion) if config.move else None
@@ -126,7 +128,10 @@ class Trainer:
         if self.positions:
             state = self.positions.state()
             tensors |= {_POSITIONS + name: tensor for name, tensor in state.items() if name not in tensors}
-        return Checkpoint(self.iteration, self.config, self._capture_description, tensors, self.budget, self.history)
+        strategy = type(self.strategy).__name__
+        return Checkpoint(
+            self.iteration, self.config, self._capture_description, tensors, self.budget, strategy, self.history
+        )
 
     @staticmethod
     def resume(
@@ -140,6 +145,7 @@ class Trainer:
         checkpoint.config.require_same_run(config)
         trainer = Trainer(capture, config, checkpoint.mesh(), strategy)
         require_same_capture(checkpoint.capture, trainer._capture_description)
+        checkpoint.require_strategy(type(trainer.strategy).__name__)
         checkpoint.require_tensors_like(trainer.checkpoint().tensors)
         trainer.parameters.restore(checkpoint.tensors)
         if trainer.positions:
@@ -214,8 +220,8 @@ class Trainer:
                 cells_before=mesh.num_cells,
                 cells=self.mesh.num_cells,
                 vertices=self.mesh.num_vertices,
-                collapsed=refinement.collapsed,
-                bisected=refinement.bisected,
+                removed=refinement.removed,
+                added=refinement.added,
                 flipped=refinement.flipped,
                 predicted=refinement.predicted,
                 error_before=before,
@@ -294,20 +300,39 @@ def _added(totals: MoveTotals, report: StepReport) -> MoveTotals:
     return MoveTotals(*(a + b for a, b in zip(astuple(totals), (1, *astuple(report)), strict=True)))
 
 
-def require_fittable(capture: Capture, config: FitConfig) -> None:
+def require_fittable(capture: Capture, config: FitConfig, strategy: Strategy | None) -> None:
     """Checks what can be known before the first iteration.
 
     Raises:
         CaptureError: The images have no alpha but the background needs it.
-        FitError: The device does not exist.
+        FitError: The device does not exist or cannot move vertices, or a strategy would refine a field on cells.
         BackendError: No back end works, or the device has none.
     """
+    if strategy is not None and config.location == "cell":
+        raise FitError("A field on cells cannot be refined; put it on vertices (location vertex), or do not refine.")
     if config.needs_alpha and capture.alphas is None:
         raise CaptureError(
             f"The images of '{capture.name}' have no alpha, which the background {config.background} needs; "
             "use background black."
         )
-    resolve_device(config.device)
+    device = _device_of(config, strategy)
+    if device.type in _WITHOUT_DOUBLES and _changes_meshes(config, strategy):
+        raise FitError(
+            f"Vertices move and meshes change in double precision, which {device.type} lacks; use the device cpu, or "
+            "neither move nor refine (--no-move --refine none)."
+        )
+
+
+def _changes_meshes(config: FitConfig, strategy: Strategy | None) -> bool:
+    return config.move or strategy is not None
+
+
+def _device_of(config: FitConfig, strategy: Strategy | None) -> torch.device:
+    """The device that the options name; by default the best one that can do what they ask for."""
+    device = resolve_device(config.device)
+    if config.device is None and device.type in _WITHOUT_DOUBLES and _changes_meshes(config, strategy):
+        return resolve_device("cpu")
+    return device
 
 
 def build_grid(capture: Capture, config: FitConfig, strategy: Strategy | None) -> TetMesh:

@@ -7,7 +7,7 @@ import torch
 from difftetvr.errors import MeshError
 from difftetvr.mesh.arrays import chunks, true_indices
 from difftetvr.mesh.change import MeshChange, check_indices, with_midpoints
-from difftetvr.mesh.incidence import cell_edges, known_edges
+from difftetvr.mesh.incidence import cell_edges, cells_per_edge, known_edges
 from difftetvr.mesh.independent import best_first, independent_set
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.mesh.topology import LOCAL_EDGES
@@ -80,7 +80,7 @@ def independent_edges(
     queue = candidates[best_first(priority.detach()[candidates])]
 
     table = cell_edges(mesh.topology)
-    degrees = _cells_per_edge(table, num_edges)
+    degrees = cells_per_edge(mesh.topology)
     blocked = torch.zeros(num_edges, dtype=torch.bool, device=queue.device)
     chosen, added = [queue[:0]], 0
     # With a budget the head of the queue is enough; it grows until the budget is used up.
@@ -140,10 +140,6 @@ def _check_priority(priority: torch.Tensor, count: int, what: str) -> None:
         )
     if torch.isnan(priority).any():
         raise MeshError("The priority is NaN somewhere; pass real numbers, and -inf for what should come last.")
-
-
-def _cells_per_edge(table: torch.Tensor, num_edges: int) -> torch.Tensor:
-    return torch.bincount(table.view(-1), minlength=num_edges)
 
 
 def _independent_among(table: torch.Tensor, queue: torch.Tensor, num_edges: int) -> torch.Tensor:

@@ -82,7 +82,7 @@ class BoundaryConstraint:
 
 
 def removable_vertices(mesh: TetMesh, slide: bool, tolerance: float = 1e-4) -> torch.Tensor:
-    """Vertices whose removal may leave the boundary as it is: inner ones, and those that could slide along it.
+    """Vertices of cells whose removal may leave the boundary as it is: inner ones, and those that could slide along it.
 
     Args:
         mesh: Any valid mesh.
@@ -93,6 +93,7 @@ def removable_vertices(mesh: TetMesh, slide: bool, tolerance: float = 1e-4) -> t
         (V,) bool.
     """
     removable = ~boundary_vertices(mesh.topology)
+    removable &= torch.diff(mesh.topology.vertex_cells[0]) > 0
     if slide:
         constraint = BoundaryConstraint.sliding(mesh, tolerance)
         removable[constraint.vertices] = constraint.tangents.flatten(1).any(1)

@@ -161,12 +161,12 @@ def independent_flips(flips: Flips, priority: torch.Tensor) -> Flips:
     return flips.select(chosen[first_of_its_kind].sort().values)
 
 
-def apply_flips(flips: Flips, priority: torch.Tensor) -> MeshChange:
+def apply_flips(flips: Flips, priority: torch.Tensor | None = None) -> MeshChange:
     """Do the flips that `independent_flips` chooses.
 
     Args:
         flips: Flips of a mesh.
-        priority: (N,) real numbers, highest first.
+        priority: (N,) real numbers, highest first; None if the flips have been chosen already.
 
     Returns:
         The change of `flips.mesh`, cell_parents ascending. Vertices and the cells of no flip stay as they are, in their
@@ -176,7 +176,8 @@ def apply_flips(flips: Flips, priority: torch.Tensor) -> MeshChange:
     Raises:
         MeshError: priority has another length than the flips, or is NaN.
     """
-    mesh, chosen = flips.mesh, independent_flips(flips, priority)
+    mesh = flips.mesh
+    chosen = flips if priority is None else independent_flips(flips, priority)
     is_kind = {kind: true_indices(chosen.kind == kind) for kind in (TWO_TO_THREE, THREE_TO_TWO, FOUR_TO_FOUR)}
     counts = torch.ones(mesh.num_cells, dtype=torch.int64, device=mesh.tets.device)
     counts[chosen.cells[is_kind[TWO_TO_THREE], 0].long()] = 2

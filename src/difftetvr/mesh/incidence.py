@@ -23,6 +23,21 @@ def cell_edges(topology: Topology) -> torch.Tensor:
     return topology.cached("incidence.cell_edges", lambda: _build_cell_edges(topology))
 
 
+def cells_per_edge(topology: Topology) -> torch.Tensor:
+    """How many cells are around each edge; built once and kept with the topology.
+
+    Args:
+        topology: The cells.
+
+    Returns:
+        (E,) int64, for each of `topology.edges`.
+    """
+    count = topology.edges.shape[0]
+    return topology.cached(
+        "incidence.cells_per_edge", lambda: torch.bincount(cell_edges(topology).view(-1), minlength=count)
+    )
+
+
 def cell_faces(topology: Topology) -> torch.Tensor:
     """The four faces of each cell; built once and kept with the topology.
 

@@ -76,7 +76,7 @@ class HatDerivatives:
         return self.emission * color.square().sum(1) + self.absorption * density.square() + 2.0 * mixed
 
     def best_step(self, lower: torch.Tensor, upper: torch.Tensor, damping: float = 0.0) -> torch.Tensor:
-        """The step of each hat alone that minimises its model between bounds.
+        """A step of each hat alone between bounds: where none of them binds, the one that minimises its model.
 
         The density is the one that is best with the best colours, within its bounds; the colours are the best ones
         with that density, within theirs.

@@ -10,6 +10,8 @@ For each ray and each hat the kernel integrates the response of the pixel, B to 
 to one unit of density. Its sums over rays give gradient and Gauss-Newton matrix of the squared error with respect to
 the hat's four coefficients. A ray crosses the cells around a vertex, edge or face one after the other, so responses are
 carried like vertices are: what a step drops is complete, and the square of the whole is added, not those of its parts.
+Only where a ray leaves cells that are not convex together and enters them again, the parts are squared for themselves;
+that underestimates the curvature of a few edges, in random Delaunay meshes by up to a fifth.
 """
 
 from __future__ import annotations

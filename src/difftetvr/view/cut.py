@@ -14,6 +14,7 @@ from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.mesh.topology import LOCAL_EDGES
 
 _SMOOTHING = 2  # lines are drawn so many times larger, and shrunk
+_PIXELS_AT_ONCE = 2_000_000
 _LINE = (255, 255, 255)
 _LINE_STRENGTH = 0.45
 _ASIDE = 1e-6 * 0.7548776662  # planes through vertices are moved by this part of the mesh's size: no cell is cut badly
@@ -139,6 +140,17 @@ def _slab_colors(mesh: TetMesh, field: Field, thickness: float) -> np.ndarray:
 
 def _fill(triangles: np.ndarray, colors: np.ndarray, width: int, height: int) -> np.ndarray:
     """(H, W, 3) image of triangles with linear colours; black where there are none."""
+    image = np.zeros((height, width, 3))
+    extents = np.ptp(triangles, axis=1).prod(1) + 1.0
+    # As many at a time as have some million pixels in their boxes.
+    parts = np.flatnonzero(np.diff(np.cumsum(extents) // _PIXELS_AT_ONCE)) + 1
+    for some, their_colors in zip(np.split(triangles, parts), np.split(colors, parts)):
+        _fill_some(image, some, their_colors)
+    return image
+
+
+def _fill_some(image: np.ndarray, triangles: np.ndarray, colors: np.ndarray) -> None:
+    height, width = image.shape[:2]
     low = np.maximum(np.floor(triangles.min(1)).astype(int), 0)
     high = np.minimum(np.ceil(triangles.max(1)).astype(int), (width - 1, height - 1))
     spans = np.maximum(high - low + 1, 0)
@@ -156,9 +168,7 @@ def _fill(triangles: np.ndarray, colors: np.ndarray, width: int, height: int) ->
     # A hair more than the triangle, so that no pixel between two neighbours stays black.
     inside = (second >= -1e-9) & (third >= -1e-9) & (second + third <= 1 + 1e-9)
     weights = np.stack((1 - second - third, second, third), 1)[inside]
-    image = np.zeros((height, width, 3))
     image[y[inside], x[inside]] = (weights[:, :, None] * colors[owner[inside]]).sum(1)
-    return image
 
 
 def _cross(p: np.ndarray, q: np.ndarray) -> np.ndarray:

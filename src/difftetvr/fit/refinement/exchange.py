@@ -7,7 +7,7 @@ from typing import Literal
 
 import torch
 
-from difftetvr.fit.options import require
+from difftetvr.fit.options import LARGEST_COUNT, require
 from difftetvr.fit.refinement.gains import (
     CollapseCosts,
     bisection_gains,
@@ -23,7 +23,7 @@ from difftetvr.mesh.change import MeshChange
 from difftetvr.mesh.collapse import collapse_edges
 from difftetvr.mesh.flip_search import find_flips
 from difftetvr.mesh.flips import THREE_TO_TWO, TWO_TO_THREE, apply_flips, independent_flips
-from difftetvr.mesh.incidence import cell_edges, find_edges
+from difftetvr.mesh.incidence import cell_edges, cells_per_edge, find_edges
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.render.gauss_newton import ImageModel
 
@@ -33,7 +33,7 @@ _LOOKED_AT = 5.0
 
 @dataclass(frozen=True)
 class Exchange:
-    """A constant number of cells: collapse what predicts the least loss, bisect what predicts the most gain.
+    """Collapse what predicts the least loss, bisect what predicts the most gain, at a constant number of cells.
 
     A prediction is that of the quadratic model of the squared error (see `difftetvr.render.gauss_newton`) for one
     change alone: g^2 / 2h in one dimension, here in the four of colour and density.
@@ -52,17 +52,19 @@ class Exchange:
     long: float = 0.6
     """Edges that are at least this long in each of their cells, in units of the longest one, may be bisected."""
     min_quality: float = 0.1
-    """Least quality Q of cells that a collapse leaves."""
+    """Least quality Q of cells that a collapse or a flip leaves."""
     initial: float = 1.0
     """Cells to begin with, as a share of the budget."""
     flips: bool = True
     """Whether to flip faces and edges where that predicts a gain, before anything else."""
     boundary: Literal["fixed", "slide"] = "slide"
-    """Whether vertices on the boundary may be taken away where its shape does not need them."""
+    """Whether vertices on the boundary may be taken away where its shape does not need them; whether they move is for
+    --motion.boundary to say."""
 
     def __post_init__(self) -> None:
-        require(self.rounds >= 1, "rounds", self.rounds, "at least 1")
-        require(self.views >= 1, "views", self.views, "at least 1")
+        for name in ("rounds", "views"):
+            value = getattr(self, name)
+            require(1 <= value <= LARGEST_COUNT, name, value, f"at least 1 and at most {LARGEST_COUNT}")
         require(0 <= self.until <= 1, "until", self.until, "between 0 and 1")
         require(0 <= self.share < 1, "share", self.share, "at least 0 and below 1")
         require(0 < self.initial <= 1, "initial", self.initial, "greater than 0 and at most 1")
@@ -82,23 +84,25 @@ class Exchange:
         return True
 
     def target(self, moment: Moment) -> int:
-        """Cells after the refinement at a moment: they grow by equal factors, up to the budget."""
-        return round(moment.budget * self.initial ** (1.0 - self._rounds_done(moment.iteration, moment) / self.rounds))
+        """Cells after the refinement at a moment: they grow by equal factors, up to the budget, and never shrink."""
+        left = 1.0 - self._rounds_done(moment.iteration, moment) / self.rounds
+        return max(round(moment.budget * self.initial**left), min(moment.cells, moment.budget))
 
     def refine(self, situation: Situation) -> Refinement | None:
         """See `Strategy.refine`."""
-        model = situation.model()
-        exchange = _Exchange(situation.mesh, situation.values, model)
+        model, target = situation.model(), self.target(situation.moment)
+        exchange = _Exchange(situation.mesh, situation.values, model, self)
         if self.flips:
-            exchange.flip(model, self)
+            exchange.flip(model, target, self)
         if self.share:
             exchange.collapse(model, self)
-        exchange.bisect(self.target(situation.moment), self)
+        exchange.bisect(target, self)
         return exchange.refinement()
 
     def _rounds_done(self, iteration: int, moment: Moment) -> int:
-        last = self.until * moment.iterations
-        return min(self.rounds, int(self.rounds * max(iteration, 0) / last)) if last else 0
+        last = min(self.until * moment.iterations, moment.iterations - 1.0)
+        done = max(iteration, 0) / last if last >= 1.0 else 0.0
+        return min(self.rounds, int(self.rounds * done))
 
 
 @dataclass(frozen=True)
@@ -114,15 +118,16 @@ class Grow(Exchange):
 class _Exchange:
     """One round: the mesh so far, and what is known about its edges."""
 
-    def __init__(self, mesh: TetMesh, values: torch.Tensor, model: ImageModel) -> None:
-        self.mesh, self.values = mesh, values
-        gains = bisection_gains(mesh, values, model.edges)
-        self.gain, self.surplus = gains.gain, gains.surplus
+    def __init__(self, mesh: TetMesh, values: torch.Tensor, model: ImageModel, options: Exchange) -> None:
+        self.mesh = mesh
+        self.values = values.to(model.edges.gradient.dtype)
+        self.gains = bisection_gains(mesh, self.values, model.edges, options.start)
+        self.surplus: torch.Tensor | None = None
         self.changes: list[MeshChange] = []
         self.predicted = 0.0
-        self.flipped = self.collapsed = self.bisected = 0
+        self.flipped = 0
 
-    def flip(self, model: ImageModel, options: Exchange) -> None:
+    def flip(self, model: ImageModel, target: int, options: Exchange) -> None:
         """Cut the same space otherwise where that fits the images better."""
         flips = find_flips(self.mesh, min_quality=options.min_quality)
         # A 2-3 flip makes a cell more, a 3-2 flip one less: one that a bisection could use.
@@ -131,9 +136,13 @@ class _Exchange:
         worthwhile = true_indices(gain > 0)
         flips, gain = flips.select(worthwhile), gain[worthwhile]
         chosen = independent_flips(flips, gain)
+        # What collapses cannot take away again must not be added.
+        room = max(0, target - self.mesh.num_cells) + int(options.share * self.mesh.num_cells)
+        adds = (chosen.kind == TWO_TO_THREE).int()
+        chosen = chosen.select(adds.cumsum(0) * adds <= room)
         self.flipped = len(chosen)
         self.predicted += float(flip_gains(chosen, self.values, model).sum())
-        change = apply_flips(chosen, torch.zeros(len(chosen)))
+        change = apply_flips(chosen)
         self._carry_edges(change)
         self._apply(change)
 
@@ -151,7 +160,6 @@ class _Exchange:
             min_quality=options.min_quality,
             boundary=options.boundary,
         )
-        self.collapsed = self.mesh.num_vertices - change.mesh.num_vertices
         self.predicted -= _cost_of(costs, self.mesh, change)
         self._carry_edges(change)
         self._apply(change)
@@ -162,31 +170,27 @@ class _Exchange:
         ends = topology.edges.long()
         positions = self.mesh.vertices
         length = torch.linalg.vector_norm(positions[ends[:, 1]] - positions[ends[:, 0]], dim=1)
-        cells = torch.bincount(cell_edges(topology).view(-1), minlength=ends.shape[0])
-        allowed = long_edges(self.mesh, options.long) & (self.gain > 0)
+        gain = self.gains.gain
+        allowed = long_edges(self.mesh, options.long) & (gain > 0)
         budget = max(0, target - self.mesh.num_cells)
         # Gain per new cell; long edges come first, which keeps shapes good.
-        chosen = independent_edges(self.mesh, self.gain / cells * length, allowed, budget)
+        chosen = independent_edges(self.mesh, gain / cells_per_edge(topology) * length, allowed, budget)
         change = bisect_edges(self.mesh, chosen)
         done = find_edges(topology, change.parents[change.is_new].long())
-        surplus = torch.zeros((change.mesh.num_vertices, 4), dtype=self.surplus.dtype, device=self.surplus.device)
-        surplus[change.is_new] = options.start * self.surplus[done]
-        # Of a quadratic model's whole decrease, a part s of the best step wins s (2 - s).
-        self.predicted += options.start * (2.0 - options.start) * float(self.gain[done].sum())
-        self.bisected = len(done)
-        self.surplus = surplus
+        self.surplus = torch.zeros_like(change.carry(self.values))
+        self.surplus[change.is_new] = self.gains.start[done]
+        self.predicted += float(self.gains.start_gain[done].sum())
         self._apply(change)
 
     def refinement(self) -> Refinement | None:
         """What came of it."""
-        if not self.flipped + self.collapsed + self.bisected:
-            return None
-        return Refinement(self.changes, self.surplus, self.collapsed, self.bisected, self.flipped, self.predicted)
+        refinement = Refinement(self.changes, self.surplus, self.flipped, self.predicted)
+        return refinement if self.flipped + refinement.removed + refinement.added else None
 
     def _price_of_a_cell(self, options: Exchange) -> float:
         """Gain per new cell of the last bisection among the best that one round can pay for."""
-        cells = torch.bincount(cell_edges(self.mesh.topology).view(-1), minlength=len(self.gain))
-        gain, order = (self.gain / cells).sort(descending=True)
+        cells = cells_per_edge(self.mesh.topology)
+        gain, order = (self.gains.gain / cells).sort(descending=True)
         affordable = cells[order].cumsum(0) <= max(1.0, options.share * self.mesh.num_cells)
         return float(gain[max(0, int(affordable.sum()) - 1)])
 
@@ -199,8 +203,7 @@ class _Exchange:
         """What was predicted for an edge holds while its cells are the same."""
         before = edges_before(self.mesh.topology, change)
         before[cell_edges(change.mesh.topology)[_changed_cells(self.mesh, change)].view(-1).long()] = -1
-        self.gain = torch.where(before >= 0, self.gain[before], 0.0)
-        self.surplus = self.surplus[before]
+        self.gains = self.gains.at(before)
 
 
 def _changed_cells(mesh: TetMesh, change: MeshChange) -> torch.Tensor:

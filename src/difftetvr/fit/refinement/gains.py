@@ -13,7 +13,7 @@ import torch
 from difftetvr.mesh.arrays import chunks, true_indices
 from difftetvr.mesh.change import MeshChange
 from difftetvr.mesh.flips import FOUR_TO_FOUR, TWO_TO_THREE, Flips
-from difftetvr.mesh.incidence import cell_edges, cell_faces, find_edges, stars
+from difftetvr.mesh.incidence import cell_faces, cells_per_edge, find_edges, stars
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.mesh.topology import Topology
 from difftetvr.render.gauss_newton import HatDerivatives, ImageModel
@@ -29,26 +29,38 @@ class BisectionGains:
 
     Attributes:
         gain: (E,) predicted decrease of the error with the best values at the new vertex.
-        surplus: (E, 4) these values, minus the mean of the edge's ends.
+        start_gain: (E,) the same with the values it starts with.
+        start: (E, 4) these values, minus the mean of the edge's ends.
     """
 
     gain: torch.Tensor
-    surplus: torch.Tensor
+    start_gain: torch.Tensor
+    start: torch.Tensor
+
+    def at(self, edges: torch.Tensor) -> BisectionGains:
+        """The gains of some edges, (N,) indices; nothing is known of -1, which wins nothing."""
+        known = edges >= 0
+        return BisectionGains(
+            torch.where(known, self.gain[edges], 0.0),
+            torch.where(known, self.start_gain[edges], 0.0),
+            self.start[edges],
+        )
 
 
-def bisection_gains(mesh: TetMesh, values: torch.Tensor, edges: HatDerivatives) -> BisectionGains:
+def bisection_gains(mesh: TetMesh, values: torch.Tensor, edges: HatDerivatives, start: float = 1.0) -> BisectionGains:
     """Predicts what bisecting each edge would win.
 
     Args:
         mesh: The mesh.
         values: (V, 4) parameters.
         edges: Derivatives by the hats of ``mesh.topology.edges``.
+        start: Part of the best surplus that new vertices start with.
     """
     ends = mesh.topology.edges.long()
     middle = values[ends].mean(1)
     upper = torch.cat((1.0 - middle[:, :3], torch.full_like(middle[:, 3:], torch.inf)), 1)
-    surplus = edges.best_step(-middle, upper, _DAMPING)
-    return BisectionGains(edges.decrease(surplus).clamp_min(0.0), surplus)
+    best = edges.best_step(-middle, upper, _DAMPING)
+    return BisectionGains(edges.decrease(best).clamp_min(0.0), edges.decrease(start * best), start * best)
 
 
 @dataclass(frozen=True)
@@ -100,8 +112,8 @@ def collapse_costs(
     for part in chunks(len(rows), rows.device, width=_CELLS_OF_VERTEX):
         cost[part] = _cost(mesh, values, vertices[removed[part]], removed[part], kept[part])
     found = true_indices(torch.isfinite(cost))
-    cells = torch.bincount(cell_edges(mesh.topology).view(-1), minlength=edges.shape[0])
-    return CollapseCosts(rows[found], target[found], cost[found], cells[rows[found]])
+    cells = cells_per_edge(mesh.topology)[rows[found]]
+    return CollapseCosts(rows[found], target[found], cost[found], cells)
 
 
 def _neighbour_mean(edges: torch.Tensor, values: torch.Tensor) -> torch.Tensor:

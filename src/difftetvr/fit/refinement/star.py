@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
-from difftetvr.fit.options import require
+from difftetvr.fit.options import LARGEST_COUNT, require
 from difftetvr.fit.refinement.strategy import Moment, Refinement, Situation
 from difftetvr.mesh.change import MeshChange
 from difftetvr.mesh.star import star_subdivision
@@ -35,7 +35,7 @@ class Star:
     """Share of the run after which the mesh is not subdivided any more."""
 
     def __post_init__(self) -> None:
-        require(self.views >= 1, "views", self.views, "at least 1")
+        require(1 <= self.views <= LARGEST_COUNT, "views", self.views, f"at least 1 and at most {LARGEST_COUNT}")
         require(0 <= self.until <= 1, "until", self.until, "between 0 and 1")
         for name in ("share", "initial"):
             require(0 < getattr(self, name) <= 1, name, getattr(self, name), "greater than 0 and at most 1")
@@ -60,7 +60,7 @@ class Star:
         change = _largest_within(mesh, ranked[: max(1, round(self.share * mesh.num_vertices))], budget)
         if change is None:
             return None
-        return Refinement([change], bisected=change.mesh.num_vertices - mesh.num_vertices)
+        return Refinement([change])
 
 
 def _largest_within(mesh: TetMesh, vertices: torch.Tensor, budget: int) -> MeshChange | None:

@@ -65,18 +65,25 @@ class Refinement:
     Attributes:
         changes: Changes of the mesh, one after the other.
         surplus: (V', 4) what to add to the values of the vertices after the last change; None: nothing.
-        collapsed: Vertices removed.
-        bisected: Vertices added.
-        flipped: Flips.
+        flipped: Flips among the changes.
         predicted: Predicted decrease of the mean squared error of the images; None where nothing is predicted.
     """
 
     changes: list[MeshChange]
     surplus: torch.Tensor | None = None
-    collapsed: int = 0
-    bisected: int = 0
     flipped: int = 0
     predicted: float | None = None
+
+    @property
+    def added(self) -> int:
+        """Vertices that the changes make."""
+        return sum(int(change.is_new.sum()) for change in self.changes)
+
+    @property
+    def removed(self) -> int:
+        """Vertices that the changes take away."""
+        growth = sum(change.mesh.num_vertices - change.num_old_vertices for change in self.changes)
+        return self.added - growth
 
 
 class Strategy(Protocol):
