@@ -16,7 +16,7 @@ import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from rich.table import Table
-from tooth_runs import KUHN_CELLS, METHODS, Run, captures, results_of, version
+from tooth_runs import KUHN_CELLS, Run, captures, changed, results_of, version
 
 import difftetvr as dtv
 from difftetvr.fit import softplus_regularizer
@@ -27,6 +27,18 @@ from difftetvr.mesh.motion import guard_move
 PICTURE = Path("docs/images/tooth_figure8.png")
 ITERATIONS = 1000
 BETAS = (0.9, 0.99)
+
+
+OURS = Run(
+    "steps in altitudes, guarded",
+    {
+        "cells": KUHN_CELLS["5 k"],
+        "iterations": ITERATIONS,
+        "refine": "none",
+        **changed(motion={"boundary": "fixed"}),
+    },
+)
+"""The same grid, iterations and fixed boundary, moved as `fit` does."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +117,7 @@ def sweep(name: str, values: list[float], **fixed: Any) -> list[ArticleRun]:
 
 
 def figure8(processes: int) -> Table:
-    rates = [1e-6, 5e-6, 1e-5, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2]
+    rates = [1e-6, 5e-6, 1e-5, 1e-4, 3e-4, 1e-3, 3e-3]
     sweeps = {
         "rate of colours": ("color_rate", sweep("color_rate", [0.005, 0.01, 0.03, 0.06, 0.08, 0.1, 0.2])),
         "rate of positions, no guard": ("position_rate", sweep("position_rate", rates)),
@@ -115,7 +127,7 @@ def figure8(processes: int) -> Table:
     }
     runs = [run for _, members in sweeps.values() for run in members]
     results = iter(results_of("figure8", runs, processes, measure))
-    ours = results_of("table", [Run("moving, 5 k", {"cells": KUHN_CELLS["5 k"], **METHODS["moving"]})], processes)[0]
+    ours = results_of("figure8", [OURS], processes)[0]
     report = Table(title="Fig. 8: held-out PSNR in dB, and inverted cells")
     for heading in ("sweep", "value", "PSNR", "inverted cells"):
         report.add_column(heading, justify="left" if heading == "sweep" else "right")
@@ -147,7 +159,7 @@ def draw(points: dict[str, list[tuple[float, dict[str, Any]]]], ours: float) -> 
                 axes.plot(*zip(*bad, strict=True), "x", color="red", markersize=11, markeredgewidth=2)
             line.set_zorder(1)
         if "colours" not in label:
-            axes.axhline(ours, color="tab:green", linestyle="--", label="steps in altitudes, guarded (default)")
+            axes.axhline(ours, color="tab:green", linestyle="--", label="steps in altitudes, guarded")
         axes.set_xscale("log")
         axes.set_xlabel(label)
         axes.set_ylabel("held-out PSNR (dB)")
