@@ -19,8 +19,8 @@ setup:
 	@sh scripts/setup.sh
 
 demo: setup
-	$(BIN)/difftetvr fit tooth -o out/demo/uniform --cells 39780 --no-move --refine none --iterations 1000 --overwrite
-	$(BIN)/difftetvr fit tooth -o out/demo --cells 39780 --overwrite
+	$(BIN)/difftetvr fit tooth -o out/demo/uniform --cells 30000 --no-move --refine none --iterations 1000 --overwrite
+	$(BIN)/difftetvr fit tooth -o out/demo --cells 30000 --overwrite
 	$(BIN)/difftetvr compare tooth out/demo/uniform/model.vtu out/demo/model.vtu -o out/demo/demo.png \
 	    --names 'uniform grid' 'adaptive mesh'
 	@echo 'out/demo/demo.png shows the truth, a uniform grid and an adaptive mesh of as many cells, and cuts through them;'

@@ -38,7 +38,7 @@ def figure9(processes: int) -> Table:
 
 
 def draw(results: list[dict[str, Any]]) -> None:
-    figure = Figure(figsize=(11, 4.2), layout="constrained")
+    figure = Figure(figsize=(11, 4.6), layout="constrained")
     canvas = FigureCanvasAgg(figure)
     quality, size = figure.subplots(1, 2)
     for result in results:
@@ -53,5 +53,5 @@ def draw(results: list[dict[str, Any]]) -> None:
     for axes in (quality, size):
         axes.set_xlabel("iteration")
         axes.grid(alpha=0.3)
-    quality.legend(fontsize=8)
+    figure.legend(*quality.get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8)
     canvas.print_png(str(PICTURE))
