@@ -258,7 +258,7 @@ def test_damaged_checkpoint_is_one_sentence(small_capture, tmp_path, content):
         {"refine": "star", "move": False},
         {"background": "random"},
         {"background": "white", "batch_views": 3},
-        {"grid": (3, 4, 5), "haze_penalty": 0.0},
+        {"grid": (3, 4, 5), "haze_penalty": 0.0, "refine": "none"},
     ],
 )
 def test_options_learn_too(small_capture, options):
