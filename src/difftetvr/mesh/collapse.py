@@ -22,9 +22,6 @@ _SMALLEST_BATCH = 2048
 _CELLS_PER_COLLAPSE = 4
 """How many cells a collapse is expected to remove; it decides the size of batches only, never the result."""
 
-_FLAT = 1e-12
-"""Qualities below are taken for flat: rounding in float64 makes errors of less than a hundredth of that."""
-
 
 def collapse_edges(
     mesh: TetMesh,
@@ -194,8 +191,8 @@ def _valid(mesh: TetMesh, half_edges: torch.Tensor, min_quality: float) -> tuple
     positions = mesh.vertices.detach().double()
     worst = _worst(quality.quality(positions, changed), changed_owner, count)
 
-    valid = worst >= max(min_quality, _FLAT)
-    doubtful = (worst > _FLAT) & ~valid
+    valid = worst >= max(min_quality, quality.FLAT)
+    doubtful = (worst > quality.FLAT) & ~valid
     rows = true_indices(doubtful[owner])
     worst_before = _worst(quality.quality(positions, tets[rows]), owner[rows], count)
     valid |= doubtful & (worst >= worst_before)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import torch
 
+from difftetvr.mesh import quality
 from difftetvr.mesh.arrays import chunks, true_indices
 from difftetvr.mesh.flips import FOUR_TO_FOUR, THREE_TO_TWO, TWO_TO_THREE, Flips, cells_after
 from difftetvr.mesh.incidence import find_edges, stars
@@ -14,9 +15,6 @@ from difftetvr.mesh.rings import closed_rings
 from difftetvr.mesh.shapes import length_scale, measure_cells, scaled_axes
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.mesh.topology import Topology
-
-_FLAT = 1e-12
-"""Qualities below are taken for flat: rounding in float64 makes errors of less than a hundredth of that."""
 
 _WIDTH = 10
 """Numbers for each flip in the temporaries of a chunk."""
@@ -106,7 +104,7 @@ def _possible(shapes: _Shapes, candidates: _Candidates) -> Flips:
     determinants, after = _measure(shapes.axes, new)
     after = after.amin(0)
     before = _of_cells(shapes.qualities, candidates.cells).amin(0)
-    rows = true_indices((after > _FLAT) & (after >= before.clamp_max(shapes.min_quality)))
+    rows = true_indices((after > quality.FLAT) & (after >= before.clamp_max(shapes.min_quality)))
     cells, edge, ring = (
         indices.index_select(0, rows) for indices in (candidates.cells, candidates.edge, candidates.ring)
     )

@@ -17,6 +17,9 @@ from difftetvr.mesh.topology import LOCAL_EDGES
 _REGULAR_TETRAHEDRON = 6.0 * 2.0**0.5
 """Edge length cubed over volume of the regular tetrahedron."""
 
+FLAT = 1e-12
+"""Qualities below are taken for flat: rounding in float64 makes errors of less than a hundredth of that."""
+
 
 def volumes(vertices: torch.Tensor, tets: torch.Tensor) -> torch.Tensor:
     """Signed volumes of cells.

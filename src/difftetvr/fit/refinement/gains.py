@@ -148,9 +148,7 @@ def _cost(
     # differ from what the hat explains by how much their functions differ, seen from the removed vertex's place.
     sides, towards_apex = weights[:, :3], weights[:, 3]
     reach = 1.0 / (towards_apex + 3.0 * sides.amax(1).clamp_min(0.0)).clamp_min(_ON_A_FACE)
-    deviation = torch.minimum(reach, 1.0 / towards_apex.clamp_min(_ON_A_FACE)).to(values.dtype)[:, None] * (
-        extrapolated - after[owner]
-    )
+    deviation = reach.to(values.dtype)[:, None] * (extrapolated - after[owner])
     bends = hats[owner].curvature(deviation) * volume.to(values.dtype)
     total = torch.zeros_like(hats.emission).index_add_(0, owner, volume.to(values.dtype))
     bent = torch.zeros_like(total).index_add_(0, owner, bends) / total
