@@ -44,6 +44,7 @@ class Backend:
         Float2: Vector of two ``Float``, gathered as one packet.
         Float4: Vector of four ``Float``, gathered as one packet.
         UInt2: Vector of two ``UInt``, gathered as one packet.
+        UInt4: Vector of four ``UInt``, gathered as one packet.
     """
 
     name: str
@@ -56,6 +57,7 @@ class Backend:
     Float2: Any
     Float4: Any
     UInt2: Any
+    UInt4: Any
 
     @property
     def is_double(self) -> bool:
@@ -162,6 +164,7 @@ def get_backend(device: str = "cpu", dtype: torch.dtype = torch.float32) -> Back
         Float2=getattr(types, f"Array2f{suffix}"),
         Float4=getattr(types, f"Array4f{suffix}"),
         UInt2=types.Array2u,
+        UInt4=types.Array4u,
     )
 
 

@@ -1,9 +1,9 @@
-"""The adjoint of the marching renderer (Dr.Jit kernel).
+"""The adjoint of rendering (Dr.Jit kernel).
 
-It walks the same cells again, front to back. ``rest`` is the part of <dL/dimage, image> still ahead of the ray, so the
-derivative with respect to a cell's optical depth needs nothing from behind it (the inversion trick of Weiss and
-Westermann without its division). Colour enters only as <dL/dcolour, colour>: two numbers a vertex are carried. Each
-step drops exactly one vertex, so exactly one record is scattered.
+It runs through the same crossings again, front to back. ``rest`` is the part of <dL/dimage, image> still ahead of the
+ray, so the derivative with respect to a cell's optical depth needs nothing from behind it (the inversion trick of Weiss
+and Westermann without its division). Colour enters only as <dL/dcolour, colour>: two numbers a vertex are carried. Each
+step of a walk drops exactly one vertex, so exactly one record is scattered.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ from typing import Any
 
 import drjit as dr
 
-from difftetvr.render.marching import (
+from difftetvr.render.crossing import (
     Clip,
-    MarchingScene,
     Rays,
+    Span,
     Step,
+    Tracer,
+    View,
     corner_of,
     inverse_length,
-    make_rays,
     read_vertex,
-    walk,
 )
 from difftetvr.render.walk import Corner, Face
 
@@ -53,11 +53,13 @@ class Gradients:
     Attributes:
         field: (N, 4): red, green, blue, density of at least V vertices or T cells.
         vertices: (N, 4): x, y, z in camera space and padding; None if positions need no gradient.
+        limits: (H, W, 2): the distances between which rays are looked at; None if they need no gradient.
         mode: How additions of several rays to one record are reduced.
     """
 
     field: Any
     vertices: Any | None
+    limits: Any | None
     mode: dr.ReduceMode
 
 
@@ -69,11 +71,13 @@ class AdjointRay:
         transmittance: Transmittance up to the current crossing.
         rest: Part of <dL/dimage, image> that lies behind it.
         carry: Derivatives with respect to distance, density and radiance at the crossing, from the cell in front.
+        limits: Derivatives with respect to the ends of the span that is looked at; empty where none are wanted.
     """
 
     transmittance: Any
     rest: Any
     carry: list[Any]
+    limits: list[Any]
 
 
 @dataclass
@@ -91,43 +95,53 @@ def buffer_length(count: int) -> int:
     return -(-count // step) * step
 
 
-def reduce_mode(scene: MarchingScene, floats: int) -> dr.ReduceMode:
+def reduce_mode(view: View, floats: int) -> dr.ReduceMode:
     """On CPUs one gradient copy a thread beats atomics, as long as the copies fit a budget."""
-    if scene.backend.name != "llvm":
+    if view.backend.name != "llvm":
         return dr.ReduceMode.Auto
-    size = floats * (8 if scene.backend.is_double else 4) * dr.thread_count()
+    size = floats * (8 if view.backend.is_double else 4) * dr.thread_count()
     return dr.ReduceMode.Expand if size <= _EXPAND_BUDGET else dr.ReduceMode.Local
 
 
-def render_adjoint(scene: MarchingScene, image: ImageAdjoint, vertex_count: int, with_vertices: bool) -> Gradients:
-    """Gradients of a view with respect to the field and, if asked, the vertices in camera space.
+@dataclass(frozen=True)
+class Wanted:
+    """Which gradients are wanted beside the field's; the kernel is cheaper without them."""
+
+    vertices: bool
+    limits: bool
+
+
+def render_adjoint(tracer: Tracer, image: ImageAdjoint, vertex_count: int, wanted: Wanted) -> Gradients:
+    """Gradients of a view with respect to the field and, if asked, the vertices in camera space and the rays' limits.
 
     Args:
-        scene: The scene that ``render_forward`` saw.
+        tracer: The tracer that ``render_forward`` saw.
         image: Derivatives with respect to the image, and the image.
         vertex_count: Number of vertices V.
-        with_vertices: Whether positions need gradients; the kernel is cheaper without.
+        wanted: What else needs gradients.
     """
-    real = scene.backend.Float
-    field_count = buffer_length(vertex_count if scene.cells is None else dr.width(scene.cells) // 4)
-    position_count = buffer_length(vertex_count) if with_vertices else 0
+    view = tracer.view
+    real = view.backend.Float
+    field_count = buffer_length(vertex_count if view.cells is None else dr.width(view.cells) // 4)
+    position_count = buffer_length(vertex_count) if wanted.vertices else 0
     gradients = Gradients(
         dr.zeros(real, 4 * field_count),
-        dr.zeros(real, 4 * position_count) if with_vertices else None,
-        reduce_mode(scene, 4 * (field_count + position_count)),
+        dr.zeros(real, 4 * position_count) if wanted.vertices else None,
+        dr.zeros(real, dr.width(view.limits)) if wanted.limits else None,
+        reduce_mode(view, 4 * (field_count + position_count)),
     )
-    kernel = _AdjointKernel(scene, gradients, make_rays(scene), image)
-    walk(scene, kernel.rays, kernel.read, kernel.visit, kernel.leave, kernel.start())
-    scene.backend.run(gradients.field, gradients.vertices)
+    tracer.trace(lambda rays: _AdjointKernel(tracer, rays, image, gradients))
+    view.backend.run(gradients.field, gradients.vertices, gradients.limits)
     return gradients
 
 
 class _AdjointKernel:
-    """The parts of the adjoint walk: reading vertices, visiting cells, leaving the mesh."""
+    """Gathers derivatives; see :class:`difftetvr.render.crossing.Kernel`."""
 
-    def __init__(self, scene: MarchingScene, gradients: Gradients, rays: Rays, image: ImageAdjoint) -> None:
-        self.scene, self.gradients, self.rays = scene, gradients, rays
-        backend, pixel, valid = scene.backend, rays.pixel, rays.valid
+    def __init__(self, tracer: Tracer, rays: Rays, image: ImageAdjoint, gradients: Gradients) -> None:
+        self.view, self.gradients, self.rays = tracer.view, gradients, rays
+        self.span = Span.of(tracer, rays)
+        backend, pixel, valid = self.view.backend, rays.pixel, rays.valid
         light = dr.gather(backend.Float4, image.light, pixel, valid)
         seen = dr.gather(backend.Float4, image.out_light, pixel, valid)
         self.rest = sum((light[k] * seen[k] for k in range(1, 3)), light[0] * seen[0])
@@ -136,16 +150,17 @@ class _AdjointKernel:
             self.pixel.distance = dr.gather(backend.Float, image.distance, pixel, valid)
             far = dr.gather(backend.Float, image.out_distance, pixel, valid)
             self.rest = dr.fma(self.pixel.distance, far, self.rest)
-        # Accumulators of a vertex: radiance, density, and its position in the ray's frame; cells take the first two.
-        self.field_slots = 0 if scene.cells is not None else 2
+        # Accumulators of a vertex: density, radiance, and its position in the ray's frame; cells take the first two.
+        self.field_slots = 0 if self.view.cells is not None else 2
         self.slots = self.field_slots + (3 if gradients.vertices is not None else 0)
 
     def start(self) -> AdjointRay:
-        real, lanes = self.scene.backend.Float, dr.width(self.rays.pixel)
-        return AdjointRay(dr.ones(real, lanes), self.rest, [dr.zeros(real, lanes) for _ in range(3)])
+        real, lanes = self.view.backend.Float, dr.width(self.rays.pixel)
+        limits = [dr.zeros(real, lanes) for _ in range(2 if self.gradients.limits is not None else 0)]
+        return AdjointRay(dr.ones(real, lanes), self.rest, [dr.zeros(real, lanes) for _ in range(3)], limits)
 
     def read(self, vertex: Any, active: Any) -> Corner:
-        position, attributes = read_vertex(self.scene, vertex, active)
+        position, attributes = read_vertex(self.view, vertex, active)
         values = [attributes[0], self._radiance(attributes[1:])] if attributes else []
         return corner_of(self.rays.frame, vertex, position, values, self.slots)
 
@@ -154,19 +169,21 @@ class _AdjointKernel:
         return dr.fma(g[0], color[0], dr.fma(g[1], color[1], g[2] * color[2]))
 
     def visit(self, step: Step, ray: AdjointRay) -> AdjointRay:
-        entry, leaving = step.entry, step.leaving
-        clip = Clip.at_camera(entry[0], leaving[0]) if self.scene.entries.camera_inside else None
-        start = clip.apply(entry, leaving) if clip else entry
-        if self.scene.cells is not None:
-            record = dr.gather(self.scene.backend.Float4, self.scene.cells, step.cell)
+        start, end = step.entry, step.leaving
+        clip = None if self.span is None else self.span.clip(start[0], end[0])
+        if clip:
+            start, end = clip.start(step.entry, step.leaving), clip.end(step.entry, step.leaving)
+        if self.view.cells is not None:
+            record = dr.gather(self.view.backend.Float4, self.view.cells, step.cell)
             constant = [record[3], self._radiance([record[0], record[1], record[2]])]
-            start, leaving = [start[0], *constant], [leaving[0], *constant]
-        ray, at_start, at_end = self._cross(start, leaving, ray)
-        if self.scene.cells is not None:
-            self._scatter_field(step.cell, at_start[2] + at_end[2], at_start[1] + at_end[1], True)
+            start, end = [start[0], *constant], [end[0], *constant]
+        ray, at_start, at_end = self._cross(start, end, ray)
+        if self.view.cells is not None:
+            self._scatter_field(step.cell, at_start[1] + at_end[1], at_start[2] + at_end[2], True)
             at_start, at_end = at_start[:1], at_end[:1]
         if clip:
-            at_start, at_end = self._unclip(clip, entry, step.leaving, at_start, at_end)
+            at_start, at_end, at_limits = _unclip(clip, step, at_start, at_end)
+            ray.limits = [old + new for old, new in zip(ray.limits, at_limits, strict=False)]
         self._distribute(step.face, [c + g for c, g in zip(ray.carry, at_start, strict=False)])
         self._scatter(
             step.exit.vertex(step.face),
@@ -175,7 +192,7 @@ class _AdjointKernel:
         )
         step.exit.carry_adjoints(step.face, step.next_face)
         unused = [dr.zeros_like(ray.rest) for _ in range(3 - len(at_end))]
-        return AdjointRay(ray.transmittance, ray.rest, at_end + unused)
+        return AdjointRay(ray.transmittance, ray.rest, at_end + unused, ray.limits)
 
     def _cross(self, start: list[Any], end: list[Any], ray: AdjointRay) -> tuple[AdjointRay, list[Any], list[Any]]:
         """Adjoint of one cell: derivatives with respect to (distance, density, radiance) at its start and end."""
@@ -185,7 +202,7 @@ class _AdjointKernel:
             q0, q1 = dr.fma(far, t0, q0), dr.fma(far, t1, q1)
         length = dr.fmax(t1 - t0, 0.0)
         g0, g1 = q0 * ray.transmittance, q1 * ray.transmittance
-        w0, w1, transmittance, d_length, d_s0, d_s1 = self.scene.optics.adjoint(length, s0, s1, g0, g1, type(length)(0))
+        w0, w1, transmittance, d_length, d_s0, d_s1 = self.view.optics.adjoint(length, s0, s1, g0, g1, type(length)(0))
         rest = ray.rest - dr.fma(w0, g0, w1 * g1)
         # All that is still ahead is seen through this cell: its optical depth L (s0 + s1) / 2 dims the rest.
         half = 0.5 * (rest - self.pixel.optical_depth)
@@ -196,37 +213,26 @@ class _AdjointKernel:
         if far is not None:
             d_t0, d_t1 = dr.fma(far, w0, d_t0), dr.fma(far, w1, d_t1)
         at_start, at_end = [d_t0, d_s0, w0], [d_t1, d_s1, w1]
-        return AdjointRay(ray.transmittance * transmittance, rest, ray.carry), at_start, at_end
-
-    def _unclip(
-        self, clip: Clip, entry: list[Any], leaving: list[Any], at_start: list[Any], at_end: list[Any]
-    ) -> tuple[list[Any], list[Any]]:
-        """Derivatives at a clipped crossing's true entry and exit; the start itself stays at the camera."""
-        t0, t1 = entry[0], leaving[0]
-        inverse = inverse_length(t0, t1)
-        dx = sum((g * (v1 - v0) for g, v0, v1 in zip(at_start[1:], entry[1:], leaving[1:], strict=True)), t0 * 0.0)
-        dx = dr.select(clip.x < 1.0, dx * inverse * inverse, 0.0)
-        entry_gradient = [dr.select(clip.clipped, -t1 * dx, at_start[0])]
-        leaving_gradient = [dr.select(clip.clipped, dr.fma(t0, dx, at_end[0]), at_end[0])]
-        for g0, g1 in zip(at_start[1:], at_end[1:], strict=True):
-            entry_gradient.append((1.0 - clip.x) * g0)
-            leaving_gradient.append(dr.fma(clip.x, g0, g1))
-        return entry_gradient, leaving_gradient
+        return AdjointRay(ray.transmittance * transmittance, rest, ray.carry, ray.limits), at_start, at_end
 
     def leave(self, face: Face, ray: AdjointRay, active: Any) -> AdjointRay:
-        carry = ray.carry[:1] if self.scene.cells is not None else ray.carry
+        carry = ray.carry[:1] if self.view.cells is not None else ray.carry
         self._distribute(face, carry)
         for corner in face.corners:
             self._scatter(corner.vertex, corner.adjoints, active)
-        return AdjointRay(ray.transmittance, ray.rest, [dr.zeros_like(c) for c in ray.carry])
+        return AdjointRay(ray.transmittance, ray.rest, [dr.zeros_like(c) for c in ray.carry], ray.limits)
+
+    def finish(self, ray: AdjointRay) -> None:
+        if self.gradients.limits is not None:
+            packet = self.view.backend.Float2(*ray.limits)
+            dr.scatter(self.gradients.limits, packet, self.rays.pixel, self.rays.valid)
 
     def _distribute(self, face: Face, crossing: list[Any]) -> None:
         """Add a crossing's derivatives to the accumulators of its face's corners."""
         weights = face.weights()
-        if self.field_slots:
-            for corner, weight in zip(face.corners, weights, strict=True):
-                corner.adjoints[0] = dr.fma(weight, crossing[2], corner.adjoints[0])
-                corner.adjoints[1] = dr.fma(weight, crossing[1], corner.adjoints[1])
+        for corner, weight in zip(face.corners, weights, strict=True):
+            for slot in range(self.field_slots):
+                corner.adjoints[slot] = dr.fma(weight, crossing[1 + slot], corner.adjoints[slot])
         if self.gradients.vertices is None:
             return
         slope_a, slope_b = _slope(face, crossing)
@@ -243,12 +249,38 @@ class _AdjointKernel:
             position = self.rays.frame.to_camera_space(*adjoints[self.field_slots :])
             self._scatter_record(self.gradients.vertices, vertex, [*position, type(position[0])(0)], active)
 
-    def _scatter_field(self, index: Any, radiance: Any, density: Any, active: Any) -> None:
+    def _scatter_field(self, index: Any, density: Any, radiance: Any, active: Any) -> None:
         record = [radiance * g for g in self.pixel.color] + [density]
         self._scatter_record(self.gradients.field, index, record, active)
 
     def _scatter_record(self, buffer: Any, index: Any, record: list[Any], active: Any) -> None:
-        dr.scatter_add(buffer, self.scene.backend.Float4(*record), index, active, mode=self.gradients.mode)
+        dr.scatter_add(buffer, self.view.backend.Float4(*record), index, active, mode=self.gradients.mode)
+
+
+def _unclip(clip: Clip, step: Step, at_start: list[Any], at_end: list[Any]) -> tuple[list[Any], list[Any], list[Any]]:
+    """Derivatives at a clipped crossing's true entry and exit, and by the ends of the span, which do not move with it.
+
+    The part runs from x0 to x1: values there are V0 + x (V1 - V0), and x = (limit - t0) / (t1 - t0) at a limit.
+    """
+    t0, t1 = step.entry[0], step.leaving[0]
+    inverse = inverse_length(t0, t1)
+    change = [v1 - v0 for v0, v1 in zip(step.entry[1:], step.leaving[1:], strict=True)]
+    slope0, slope1 = (
+        sum((g * c for g, c in zip(values[1:], change, strict=False)), t0 * 0.0) * inverse
+        for values in (at_start, at_end)
+    )
+    # A part of no length is no part: its ends do not matter, wherever the limits are.
+    is_part = clip.last > clip.first
+    slope0, slope1 = dr.select(clip.at_near & is_part, slope0, 0.0), dr.select(clip.at_far & is_part, slope1, 0.0)
+    near = dr.select(clip.at_near & is_part, at_start[0] + slope0, 0.0)
+    far = dr.select(clip.at_far & is_part, at_end[0] + slope1, 0.0)
+    entry = dr.select(clip.at_near, 0.0, at_start[0]) - (1.0 - clip.first) * slope0 - (1.0 - clip.last) * slope1
+    leaving = dr.select(clip.at_far, 0.0, at_end[0]) - clip.first * slope0 - clip.last * slope1
+    entry_gradient, leaving_gradient = [entry], [leaving]
+    for g0, g1 in zip(at_start[1:], at_end[1:], strict=True):
+        entry_gradient.append(dr.fma(1.0 - clip.first, g0, (1.0 - clip.last) * g1))
+        leaving_gradient.append(dr.fma(clip.first, g0, clip.last * g1))
+    return entry_gradient, leaving_gradient, [near, far]
 
 
 def _slope(face: Face, crossing: list[Any]) -> tuple[Any, Any]:

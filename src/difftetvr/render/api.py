@@ -12,10 +12,10 @@ from difftetvr.backend import backend_for
 from difftetvr.errors import DiffTetError, MeshError
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.optics import ConstantPerCell, ExactLinear, OpticalModel
-from difftetvr.render.autograd import MarchingFunction, MarchingTask
+from difftetvr.render.autograd import TRACERS, RenderFunction, RenderTask
 from difftetvr.render.camera import Camera
 
-RENDERERS = ("marching",)
+RENDERERS = tuple(TRACERS)
 _SMALL = 1e-6  # within this and its inverse, coordinates are left as they are
 
 
@@ -73,9 +73,9 @@ def render(
     """
     if renderer not in RENDERERS:
         raise DiffTetError(f"There is no renderer '{renderer}'; choose one of {', '.join(RENDERERS)}.")
-    view = prepare_view(mesh, field, camera, optics, transmittance_threshold, deterministic)
+    view = prepare_view(mesh, field, camera, optics, transmittance_threshold, deterministic, renderer)
     behind = as_background(background, mesh.vertices)
-    light, distance = MarchingFunction.apply(view.task, view.vertices, view.color, view.density)
+    light, distance = RenderFunction.apply(view.task, view.vertices, view.color, view.density, None)
     return compose(light, _times(distance, view.unit), behind)
 
 
@@ -91,7 +91,7 @@ class PreparedView:
         unit: The unit, in world units.
     """
 
-    task: MarchingTask
+    task: RenderTask
     vertices: torch.Tensor
     color: torch.Tensor
     density: torch.Tensor
@@ -105,6 +105,7 @@ def prepare_view(
     optics: OpticalModel | None,
     transmittance_threshold: float,
     deterministic: bool,
+    renderer: str = "marching",
 ) -> PreparedView:
     """Check a view's inputs and bring them into camera space; arguments and errors are those of :func:`render`."""
     if not 0.0 <= transmittance_threshold < 1.0:
@@ -120,7 +121,7 @@ def prepare_view(
     field.validate(mesh)
     if optics is None:
         optics = ConstantPerCell() if per_cell else ExactLinear()
-    task = MarchingTask(backend, mesh, camera, optics, per_cell, transmittance_threshold, deterministic)
+    task = RenderTask(backend, mesh, camera, optics, per_cell, transmittance_threshold, deterministic, renderer)
     vertices, unit = _unit_of_length(camera.to_camera_space(mesh.vertices), mesh)
     return PreparedView(task, vertices, field.color, _times(field.density, unit), unit)
 

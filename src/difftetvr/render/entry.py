@@ -17,7 +17,7 @@ from difftetvr.mesh import TetMesh
 from difftetvr.render.camera import Camera
 from difftetvr.render.camera_inside import cells_around_camera, start_rows
 from difftetvr.render.entry_table import EntryScene, EntryTable
-from difftetvr.render.rasterise import WorkItems, for_each_hit, work_items
+from difftetvr.render.rasterise import Hit, WorkItems, for_each_hit, work_items
 from difftetvr.render.rays import Pinhole
 
 
@@ -66,7 +66,7 @@ def find_entries(backend: Backend, mesh: TetMesh, camera_vertices: torch.Tensor,
         *(backend.uints(part) for part in (table.corners, table.cells, table.apices)),
     )
     start = None if around is None else start_rows(scene, mesh, around, boundary_rows)
-    items = work_items(scene, boundary_rows)
+    items = work_items(scene, 0, boundary_rows)
     count, rows = _count(scene, items, start)
     is_simple = int(dr.max(count)[0]) <= 1
     if is_simple:
@@ -86,9 +86,10 @@ def _count(scene: EntryScene, items: WorkItems | None, start: Any | None) -> tup
         count, row_of_pixel = dr.select(start != scene.no_row, uint(1), uint(0)), uint(start)
         scene.backend.run(count, row_of_pixel)
 
-    def visit(pixel: Any, row: Any, depth: Any, hit: Any) -> None:
-        dr.scatter_add(count, uint(1), pixel, hit)
-        dr.scatter(row_of_pixel, row, pixel, hit)
+    def visit(hit: Hit) -> None:
+        pixel = hit.row * scene.pinhole.width + hit.column
+        dr.scatter_add(count, uint(1), pixel, hit.is_hit)
+        dr.scatter(row_of_pixel, hit.face, pixel, hit.is_hit)
 
     for_each_hit(scene, items, visit)
     scene.backend.run(count, row_of_pixel)
@@ -113,10 +114,11 @@ def _fill(scene: EntryScene, items: WorkItems | None, start: Any | None, offset:
         used = dr.select(has_start, uint(1), uint(0))
     scene.backend.run(rows, depths, used)
 
-    def visit(pixel: Any, row: Any, depth: Any, hit: Any) -> None:
-        slot = dr.gather(uint, offset, pixel, hit) + dr.scatter_inc(used, pixel, hit)
-        dr.scatter(rows, row, slot, hit)
-        dr.scatter(depths, depth, slot, hit)
+    def visit(hit: Hit) -> None:
+        pixel = hit.row * scene.pinhole.width + hit.column
+        slot = dr.gather(uint, offset, pixel, hit.is_hit) + dr.scatter_inc(used, pixel, hit.is_hit)
+        dr.scatter(rows, hit.face, slot, hit.is_hit)
+        dr.scatter(depths, hit.depth, slot, hit.is_hit)
 
     for_each_hit(scene, items, visit)
     scene.backend.run(rows, depths)

@@ -11,7 +11,7 @@ from difftetvr.mesh import Field, TetMesh
 from difftetvr.render.api import as_background, compose, prepare_view
 from difftetvr.render.camera import Camera
 from difftetvr.render.hats import RECORD, HatImage, hat_records
-from difftetvr.render.marching import render_forward
+from difftetvr.render.forward import render_forward
 
 _TINY = 1e-30
 
@@ -180,12 +180,12 @@ def model_image(
     behind = as_background(background, mesh.vertices)
     backend, size = view.task.backend, (camera.height, camera.width)
     with backend.exclusive(one_thread=deterministic):
-        scene = view.task.scene(view.vertices, view.color, view.density)
-        light, distance = render_forward(scene)
+        tracer = view.task.tracer(view.vertices, view.color, view.density)
+        light, distance = render_forward(tracer)
         image = compose(backend.tensor(light, *size, 4), backend.tensor(distance, *size), behind).color
         residual = image - truth.to(image)
         curvature = 2.0 / residual.numel()
-        records = hat_records(scene, mesh, HatImage(backend.floats(image), backend.floats(curvature * residual)))
+        records = hat_records(tracer, mesh, HatImage(backend.floats(image), backend.floats(curvature * residual)))
         counts = (mesh.num_vertices, mesh.topology.edges.shape[0], mesh.topology.faces.shape[0])
         vertices, edges, faces = (
             _derivatives(backend.tensor(buffer).reshape(-1, RECORD)[:count], curvature).with_density_unit(view.unit)

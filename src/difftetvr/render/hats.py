@@ -26,7 +26,7 @@ from difftetvr.mesh import TetMesh
 from difftetvr.mesh.incidence import cell_edges, cell_faces
 from difftetvr.mesh.topology import LOCAL_EDGE_OF, LOCAL_EDGES
 from difftetvr.render.adjoint import buffer_length, reduce_mode
-from difftetvr.render.marching import Clip, MarchingScene, Step, corner_of, make_rays, read_vertex, walk
+from difftetvr.render.crossing import Rays, Span, Step, Tracer, View, corner_of, read_vertex
 from difftetvr.render.walk import Corner, Face
 
 RECORD = 12
@@ -55,10 +55,10 @@ class HatTables:
     faces: Any
 
     @staticmethod
-    def of(scene: MarchingScene, mesh: TetMesh) -> HatTables:
+    def of(view: View, mesh: TetMesh) -> HatTables:
         """Upload the tables of a mesh; built once for a topology."""
         edges, faces = mesh.topology.cached("render.hat_tables", lambda: _ranked_tables(mesh))
-        return HatTables(scene.backend.uints(edges), scene.backend.uints(faces))
+        return HatTables(view.backend.uints(edges), view.backend.uints(faces))
 
 
 @dataclass
@@ -122,48 +122,48 @@ class _Samples:
         return total
 
 
-def hat_records(scene: MarchingScene, mesh: TetMesh, image: HatImage) -> HatRecords:
+def hat_records(tracer: Tracer, mesh: TetMesh, image: HatImage) -> HatRecords:
     """Sums over the rays of a view for every vertex, edge and face.
 
     Args:
-        scene: The scene of the view; its field lives on vertices.
-        mesh: The mesh of the scene.
+        tracer: The view, to be walked through; its field lives on vertices.
+        mesh: The mesh that is seen.
         image: The rendered image, and the derivative of the loss with respect to it.
     """
-    topology = mesh.topology
+    view, topology = tracer.view, mesh.topology
     counts = [buffer_length(n) for n in (mesh.num_vertices, topology.edges.shape[0], topology.faces.shape[0])]
-    vertices, edges, faces = buffers = [dr.zeros(scene.backend.Float, RECORD * count) for count in counts]
-    records = HatRecords(vertices, edges, faces, reduce_mode(scene, RECORD * sum(counts)))
-    kernel = _HatKernel(scene, HatTables.of(scene, mesh), records, image)
-    walk(scene, kernel.rays, kernel.read, kernel.visit, kernel.leave, kernel.start())
-    scene.backend.run(*buffers)
+    vertices, edges, faces = buffers = [dr.zeros(view.backend.Float, RECORD * count) for count in counts]
+    records = HatRecords(vertices, edges, faces, reduce_mode(view, RECORD * sum(counts)))
+    tables = HatTables.of(view, mesh)
+    tracer.trace(lambda rays: _HatKernel(tracer, rays, tables, records, image))
+    view.backend.run(*buffers)
     return records
 
 
 class _HatKernel:
-    """The parts of the walk: reading vertices, visiting cells, leaving the mesh."""
+    """Gathers responses; see :class:`difftetvr.render.crossing.Kernel`."""
 
-    def __init__(self, scene: MarchingScene, tables: HatTables, records: HatRecords, image: HatImage) -> None:
-        self.scene, self.tables, self.records = scene, tables, records
-        self.rays = make_rays(scene)
-        pixel, valid = self.rays.pixel, self.rays.valid
+    def __init__(self, tracer: Tracer, rays: Rays, tables: HatTables, records: HatRecords, image: HatImage) -> None:
+        self.view, self.rays, self.tables, self.records = tracer.view, rays, tables, records
+        self.span = Span.of(tracer, rays)
+        pixel, valid = rays.pixel, rays.valid
         self.color, self.gradient = (
-            [dr.gather(scene.backend.Float, array, 3 * pixel + k, valid) for k in range(3)]
+            [dr.gather(self.view.backend.Float, array, 3 * pixel + k, valid) for k in range(3)]
             for array in (image.color, image.gradient)
         )
 
     def start(self) -> HatRay:
         lanes = dr.width(self.rays.pixel)
         return HatRay(
-            dr.ones(self.scene.backend.Float, lanes),
+            dr.ones(self.view.backend.Float, lanes),
             self.color,
             [self._no_response() for _ in range(3)],
-            [dr.full(self.scene.backend.UInt, _UNKNOWN, lanes) for _ in range(3)],
+            [dr.full(self.view.backend.UInt, _UNKNOWN, lanes) for _ in range(3)],
             self._no_response(),
         )
 
     def read(self, vertex: Any, active: Any) -> Corner:
-        position, attributes = read_vertex(self.scene, vertex, active)
+        position, attributes = read_vertex(self.view, vertex, active)
         return corner_of(self.rays.frame, vertex, position, attributes, 4)
 
     def visit(self, step: Step, ray: HatRay) -> HatRay:
@@ -181,13 +181,17 @@ class _HatKernel:
         fresh = self.start()
         return HatRay(ray.transmittance, ray.rest, fresh.edges, fresh.edge_ids, fresh.face)
 
+    def finish(self, ray: HatRay) -> None:
+        """Nothing is kept of the rays themselves."""
+
     def _sample(self, step: Step, ray: HatRay) -> tuple[_Samples, Any, list[Any]]:
         """The crossing in pieces, and transmittance and rest behind it."""
         entry, leaving = step.entry, step.leaving
         first, last = _barycentric(step)
-        if self.scene.entries.camera_inside:
-            clip = Clip.at_camera(entry[0], leaving[0])
-            first, entry = clip.apply(first, last), clip.apply(entry, leaving)
+        if self.span is not None:
+            clip = self.span.clip(entry[0], leaving[0])
+            first, last = clip.start(first, last), clip.end(first, last)
+            entry, leaving = clip.start(entry, leaving), clip.end(entry, leaving)
         length = dr.fmax(leaving[0] - entry[0], 0.0)
         piece = length * (1.0 / _SAMPLES)
         transmittance, rest = ray.transmittance, ray.rest
@@ -204,7 +208,7 @@ class _HatKernel:
             samples.responses.append([seen, *dims])
             samples.weights.append([dr.fma(x, w1 - w0, w0) for w0, w1 in zip(first, last, strict=True)])
         # The state goes on exactly: errors of the pieces do not add up along the ray.
-        w0, w1, through = self.scene.optics.weights(length, entry[1], leaving[1])
+        w0, w1, through = self.view.optics.weights(length, entry[1], leaving[1])
         w0, w1 = w0 * ray.transmittance, w1 * ray.transmittance
         colors = zip(entry[2:], leaving[2:], ray.rest, strict=True)
         return samples, ray.transmittance * through, [r - dr.fma(w0, c0, w1 * c1) for c0, c1, r in colors]
@@ -221,7 +225,7 @@ class _HatKernel:
 
     def _finish_edges(self, step: Step, ray: HatRay, samples: _Samples) -> tuple[list[Response], list[Any]]:
         """Scatter the three edges at the dropped corner; returns those of the next face."""
-        uint = self.scene.backend.UInt
+        uint = self.view.backend.UInt
         ranks, pick = _ranks(step), step.exit.pick
         new_ids = [dr.gather(uint, self.tables.edges, _edge_row(step.cell, ranks[k], ranks[_APEX])) for k in range(3)]
         old_ids, old = [], []
@@ -247,7 +251,7 @@ class _HatKernel:
 
     def _finish_faces(self, step: Step, ray: HatRay, samples: _Samples) -> Response:
         """Scatter the face entered through and the two passed by; returns the response of the face left through."""
-        uint, faces = self.scene.backend.UInt, self.tables.faces
+        uint, faces = self.view.backend.UInt, self.tables.faces
         ranks, pick = _ranks(step), step.exit.pick
         entered = _plus(ray.face, samples.respond((0, 1, 2)))
         self._scatter(self.records.faces, dr.gather(uint, faces, 4 * step.cell + ranks[_APEX]), entered, True)
@@ -259,7 +263,7 @@ class _HatKernel:
         return _pick(pick, opposite)
 
     def _scatter(self, buffer: Any, index: Any, response: Response, active: Any) -> None:
-        float4 = self.scene.backend.Float4
+        float4 = self.view.backend.Float4
         b, d, g = response[0], response[1:], self.gradient
         zero = dr.zeros_like(b)
         slope = dr.fma(g[0], d[0], dr.fma(g[1], d[1], g[2] * d[2]))
@@ -269,7 +273,7 @@ class _HatKernel:
             dr.scatter_add(buffer, float4(*packet), 3 * index + k, active, mode=self.records.mode)
 
     def _no_response(self) -> Response:
-        return [dr.zeros(self.scene.backend.Float, dr.width(self.rays.pixel)) for _ in range(4)]
+        return [dr.zeros(self.view.backend.Float, dr.width(self.rays.pixel)) for _ in range(4)]
 
 
 def _barycentric(step: Step) -> tuple[list[Any], list[Any]]:

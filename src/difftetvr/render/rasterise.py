@@ -1,4 +1,4 @@
-"""Boundary faces to pixels, by the exact rule of the walk (Dr.Jit)."""
+"""Faces to pixels, by the exact rule of the walk (Dr.Jit)."""
 
 from __future__ import annotations
 
@@ -9,49 +9,87 @@ from typing import Any
 import drjit as dr
 import torch
 
-from difftetvr.render.entry_table import EntryScene
+from difftetvr.render.entry_table import FaceScene
 from difftetvr.render.rays import pixel_frame
 from difftetvr.render.walk import Corner, crossing_depth, holds_ray, make_face
+
+_ITEM_PIXELS = 64  # a work item has about so many pixels, at most _ITEM_ROWS rows, and at least one
+_ITEM_ROWS = 8
+# Beyond what rounding moves a projection by, for images of up to 64 k pixels; the exact rule decides.
+_MARGIN = 0.0625
 
 
 @dataclass
 class WorkItems:
-    """Pieces of faces to rasterise: each is one image row of one face's bounding box."""
+    """Pieces of faces to rasterise: each is some image rows of one face's bounding box.
+
+    Attributes:
+        face: Row of the face in its scene.
+        first_row, last_row, first_column, last_column: The pixels, ends included.
+    """
 
     face: Any
-    row: Any
+    first_row: Any
+    last_row: Any
     first_column: Any
     last_column: Any
 
 
-def work_items(scene: EntryScene, rows: int) -> WorkItems | None:
-    """Work items of the table's first ``rows`` rows, None if no face is in sight."""
-    backend, uint = scene.backend, scene.backend.UInt
-    (column0, column1), (row0, row1), visible = _pixel_boxes(scene, dr.arange(uint, rows))
-    heights = backend.tensor(dr.select(visible, row1 - row0 + 1, 0))
-    faces = torch.arange(rows, dtype=torch.int32, device=backend.device)
-    owners = torch.repeat_interleave(faces, heights)
-    total = owners.shape[0]
-    if total == 0:
-        return None
-    begins = (heights.cumsum(0) - heights).to(torch.int32)
-    owner = backend.uints(owners)
-    offset = dr.arange(uint, total) - dr.gather(uint, backend.uints(begins), owner)
-    row = uint(dr.gather(backend.Int, row0, owner)) + offset
-    first_column, last_column = (uint(dr.gather(backend.Int, c, owner)) for c in (column0, column1))
-    backend.run(owner, row, first_column, last_column)
-    return WorkItems(owner, row, first_column, last_column)
+@dataclass
+class Hit:
+    """A ray that may meet a face; ``is_hit`` masks those that enter through it in front of the camera."""
+
+    column: Any
+    row: Any
+    face: Any
+    depth: Any
+    is_hit: Any
 
 
-def _pixel_boxes(scene: EntryScene, face: Any) -> tuple[tuple[Any, Any], tuple[Any, Any], Any]:
+@dataclass
+class _Boxes:
     """First and last column and row of the pixels that may see each face, and whether there are any."""
-    uint, real, pinhole = scene.backend.UInt, scene.backend.Float, scene.pinhole
+
+    columns: tuple[Any, Any]
+    rows: tuple[Any, Any]
+    visible: Any
+
+
+def work_items(scene: FaceScene, begin: int, end: int) -> WorkItems | None:
+    """Work items of the faces from row ``begin`` to before ``end``, None if none of them is in sight."""
+    backend, uint, integer = scene.backend, scene.backend.UInt, scene.backend.Int
+    face = dr.arange(uint, end - begin) + backend.opaque_uint(begin)
+    boxes = _pixel_boxes(scene, face)
+    (row0, row1), (column0, column1) = boxes.rows, boxes.columns
+    width = dr.fmax(scene.backend.Float(column1 - column0 + 1), 1.0)
+    per_item = integer(dr.fmin(dr.fmax(_ITEM_PIXELS / width, 1.0), float(_ITEM_ROWS)))
+    count = dr.select(boxes.visible, (row1 - row0 + per_item) // per_item, 0)
+    backend.run(count, row0, row1, column0, column1, per_item)
+    counts = backend.tensor(count)
+    owners = torch.repeat_interleave(
+        torch.arange(end - begin, dtype=torch.int32, device=backend.device), counts, output_size=int(counts.sum())
+    )
+    if owners.shape[0] == 0:
+        return None
+    begins = (counts.cumsum(0) - counts).to(torch.int32)
+    owner = backend.uints(owners)
+    index = integer(dr.arange(uint, owners.shape[0]) - dr.gather(uint, backend.uints(begins), owner))
+    step = dr.gather(integer, per_item, owner)
+    first = dr.gather(integer, row0, owner) + index * step
+    last = dr.fmin(backend.Float(first + step - 1), backend.Float(dr.gather(integer, row1, owner)))
+    columns = (uint(dr.gather(integer, column, owner)) for column in (column0, column1))
+    items = WorkItems(owner + backend.opaque_uint(begin), uint(first), uint(integer(last)), *columns)
+    backend.run(items)
+    return items
+
+
+def _pixel_boxes(scene: FaceScene, face: Any) -> _Boxes:
+    real, pinhole = scene.backend.Float, scene.pinhole
     infinity = real(dr.inf)
     low, high = [infinity, infinity], [-infinity, -infinity]
     nearest, farthest = infinity, -infinity
-    for k in range(3):
-        vertex = dr.gather(uint, scene.corners, 3 * face + k)
-        x, y, z = (dr.gather(real, scene.vertices, 3 * vertex + axis) for axis in range(3))
+    points = [scene.point(vertex) for vertex in scene.indices(face)]
+    for x, y, z in points:
         inverse = 1.0 / z
         for axis, value in enumerate((x * inverse * pinhole.fx + pinhole.cx, y * inverse * pinhole.fy + pinhole.cy)):
             low[axis] = dr.fmin(low[axis], value)
@@ -61,31 +99,48 @@ def _pixel_boxes(scene: EntryScene, face: Any) -> tuple[tuple[Any, Any], tuple[A
     box = []
     for axis, size in enumerate((pinhole.width, pinhole.height)):
         last = real(size) - 1.0
-        # One pixel of margin covers the rounding of the projection; the exact rule decides.
-        begin = dr.select(crosses, 0.0, dr.fmin(dr.fmax(low[axis] - 1.5, 0.0), last + 1.0))
-        end = dr.select(crosses, last, dr.fmin(dr.fmax(high[axis] + 0.5, -1.0), last))
-        box.append((scene.backend.Int(dr.floor(begin)), scene.backend.Int(dr.floor(end))))
-    visible = (farthest > 0) & (box[0][1] >= box[0][0]) & (box[1][1] >= box[1][0])
-    return box[0], box[1], visible
+        # Pixel i's ray goes through i + 1/2: those from ceil(low - 1/2) to floor(high - 1/2) may see the face.
+        begin = dr.select(crosses, 0.0, dr.fmin(dr.fmax(dr.ceil(low[axis] - (0.5 + _MARGIN)), 0.0), last + 1.0))
+        end = dr.select(crosses, last, dr.fmin(dr.fmax(dr.floor(high[axis] - (0.5 - _MARGIN)), -1.0), last))
+        box.append((scene.backend.Int(begin), scene.backend.Int(end)))
+    (columns, rows) = box
+    visible = (farthest > 0) & (columns[1] >= columns[0]) & (rows[1] >= rows[0]) & _may_face_camera(points)
+    return _Boxes(columns, rows, visible)
 
 
-def for_each_hit(scene: EntryScene, items: WorkItems | None, visit: Callable[..., None]) -> None:
-    """Call ``visit(pixel, row, depth, hit)`` for each pixel of each work item; ``hit`` masks true entries."""
+def _may_face_camera(points: list[list[Any]]) -> Any:
+    """Whether rays can enter through a face: not if the camera lies clearly on the inner side of its plane."""
+    p, q, r = points
+    e, f = ([v - u for u, v in zip(p, other, strict=True)] for other in (q, r))
+    normal = [e[1] * f[2] - e[2] * f[1], e[2] * f[0] - e[0] * f[2], e[0] * f[1] - e[1] * f[0]]
+    side = normal[0] * p[0] + normal[1] * p[1] + normal[2] * p[2]
+    size, sides = _norm(p), _norm(e) + _norm(f)
+    # A ray's frame rounds offsets by parts of the distance, so faces seen edge-on are left to the exact rule.
+    return side >= -16.0 * dr.epsilon(side) * size * (size + sides) * sides
+
+
+def _norm(vector: list[Any]) -> Any:
+    return dr.abs(vector[0]) + dr.abs(vector[1]) + dr.abs(vector[2])
+
+
+def for_each_hit(scene: FaceScene, items: WorkItems | None, visit: Callable[[Hit], None]) -> None:
+    """Call ``visit`` for each pixel of each work item."""
     if items is None:
         return
-    uint, real = scene.backend.UInt, scene.backend.Float
-    vertices = [dr.gather(uint, scene.corners, 3 * items.face + k) for k in range(3)]
-    points = [[dr.gather(real, scene.vertices, 3 * vertex + axis) for axis in range(3)] for vertex in vertices]
+    vertices = scene.indices(items.face)
+    points = [scene.point(vertex) for vertex in vertices]
 
-    def body(column: Any) -> tuple[Any]:
-        frame = pixel_frame(scene.pinhole, column, items.row)
+    def body(column: Any, row: Any) -> tuple[Any, Any]:
+        frame = pixel_frame(scene.pinhole, column, row)
         corners = []
         for vertex, point in zip(vertices, points, strict=True):
             a, b, t = frame.project(*point)
             corners.append(Corner(vertex, a, b, [t], []))
         face = make_face(corners)
         depth = crossing_depth(face)
-        visit(items.row * scene.pinhole.width + column, items.face, depth, holds_ray(face) & (depth > 0))
-        return (column + 1,)
+        visit(Hit(column, row, items.face, depth, holds_ray(face) & (depth > 0)))
+        ends = column == items.last_column
+        return dr.select(ends, items.first_column, column + 1), dr.select(ends, row + 1, row)
 
-    dr.while_loop((uint(items.first_column),), lambda column: column <= items.last_column, body)
+    start = (type(items.face)(items.first_column), type(items.face)(items.first_row))
+    dr.while_loop(start, lambda column, row: row <= items.last_row, body)

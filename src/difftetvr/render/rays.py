@@ -93,6 +93,21 @@ def lane_pixel(pinhole: Pinhole, lane: Any) -> tuple[Any, Any, Any]:
     return column, row, (column < pinhole.width) & (row < pinhole.height)
 
 
+def pixel_lane(pinhole: Pinhole, column: Any, row: Any) -> Any:
+    """The lane of a pixel: the inverse of :func:`lane_pixel`."""
+    mask = (1 << _BLOCK_BITS) - 1
+    blocks_per_row = (pinhole.width + mask) >> _BLOCK_BITS
+    block = (row >> _BLOCK_BITS) * blocks_per_row + (column >> _BLOCK_BITS)
+    return (block << (2 * _BLOCK_BITS)) + _spread_bits(column & mask) + (_spread_bits(row & mask) << 1)
+
+
+def _spread_bits(code: Any) -> Any:
+    """Put six bits at the even places of a Morton code."""
+    code = (code | (code << 4)) & 0x30F
+    code = (code | (code << 2)) & 0x333
+    return (code | (code << 1)) & 0x555
+
+
 def _even_bits(code: Any) -> Any:
     """Gather the six even bits of a Morton code."""
     code = code & 0x555
