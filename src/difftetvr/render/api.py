@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +15,7 @@ from difftetvr.mesh import Field, TetMesh
 from difftetvr.optics import ConstantPerCell, ExactLinear, OpticalModel
 from difftetvr.render.autograd import TRACERS, RenderFunction, RenderTask
 from difftetvr.render.camera import Camera
+from difftetvr.render.clip_plane import clip_limits
 
 RENDERERS = tuple(TRACERS)
 _SMALL = 1e-6  # within this and its inverse, coordinates are left as they are
@@ -45,23 +47,27 @@ def render(
     optics: OpticalModel | None = None,
     transmittance_threshold: float = 0.0,
     deterministic: bool = False,
+    clip_plane: Sequence[float] | torch.Tensor | None = None,
 ) -> RenderedImage:
     """Render a tetrahedral mesh by emission and absorption (article section 3, solved exactly).
 
-    Differentiable once in ``mesh.vertices``, ``field.color``, ``field.density``, ``camera.world_to_camera`` and
-    ``background``, as far as these require gradients. Runs on the device and at the precision of ``mesh.vertices``.
+    Differentiable once in ``mesh.vertices``, ``field.color``, ``field.density``, ``camera.world_to_camera``,
+    ``background`` and ``clip_plane``, as far as these require gradients. Runs on the device and at the precision of ``mesh.vertices``.
 
     Args:
         mesh: Tetrahedral mesh; its vertices' device and dtype (float32 or float64) decide where and how to render.
         field: Colour and density per vertex (linear inside each cell) or per cell (constant).
         camera: Pinhole camera, inside or outside of the mesh.
         background: (3,) linear RGB behind the volume; black if None.
-        renderer: How crossings are found and ordered; ``"marching"``.
+        renderer: How crossings are found and ordered. ``"marching"`` walks from cell to cell; ``"linked-list"`` sorts
+            the crossings of each pixel; ``"projected"`` sorts the cells once for the whole view, which also renders
+            loose cells, but warns (`OrderWarning`) where no exact order is certain. All use the same optics.
         optics: Optical model of one cell; exact integration of the linear field if None.
         transmittance_threshold: Rays stop once their transmittance is at or below this value, in [0, 1); 0 stops none
             before it vanishes.
         deterministic: Whether gradients are the same in every run to the last bit: the backward pass then runs on one
             thread. CPU only. Images always are.
+        clip_plane: (4,) a, b, c, d: only what lies in the half-space a x + b y + c z + d >= 0 of the world is seen.
 
     Returns:
         The image, on the device of ``mesh.vertices``.
@@ -75,7 +81,8 @@ def render(
         raise DiffTetError(f"There is no renderer '{renderer}'; choose one of {', '.join(RENDERERS)}.")
     view = prepare_view(mesh, field, camera, optics, transmittance_threshold, deterministic, renderer)
     behind = as_background(background, mesh.vertices)
-    light, distance = RenderFunction.apply(view.task, view.vertices, view.color, view.density, None)
+    limits = None if clip_plane is None else clip_limits(clip_plane, camera, mesh.vertices) / view.unit
+    light, distance = RenderFunction.apply(view.task, view.vertices, view.color, view.density, limits)
     return compose(light, _times(distance, view.unit), behind)
 
 

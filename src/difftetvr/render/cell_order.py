@@ -16,12 +16,15 @@ from dataclasses import dataclass
 
 import torch
 
-from difftetvr.mesh.arrays import chunks, sort_keys
-from difftetvr.mesh.delaunay_check import CellShape, is_convex
+from difftetvr.mesh.arrays import chunks, put, sort_keys, true_indices
+from difftetvr.mesh.delaunay_check import CellShape, dot, is_convex
 from difftetvr.mesh.tetmesh import TetMesh
 
-_MAX_ROUNDS = 1000
-"""Rounds of moving cells back after which relations are taken to be cyclic; more than 30 were never seen otherwise."""
+_MAX_ROUNDS = 200
+"""Rounds of moving cells back one after another before all of them take turns: 20 are usual."""
+
+_MAX_MOVES = 2
+"""Moves per cell, on the average, before all of them take turns."""
 
 _FAR_CENTER = 2.0
 """Circumcentres farther away than this, in units of the cell's longest edge, say more about rounding than about place."""
@@ -29,6 +32,8 @@ _FAR_CENTER = 2.0
 _SIGN_CERTAIN = 16.0 * 2.0**-52
 """Rounding of a face's distance from the eye, times the face's area, in units of edge length times distance squared."""
 
+import os
+SURE=float(os.environ.get("SURE",0.1)); FARC=float(os.environ.get("FARC",17))
 _FIRST = -(2**63)
 _EXPONENT_AND_FRACTION = 2**63 - 1
 
@@ -66,7 +71,7 @@ def visibility_order(mesh: TetMesh, vertices: torch.Tensor) -> CellOrder:
         return CellOrder(torch.argsort(_squared_distances(positions, mesh.tets)), exact=False)
     keys, predecessors = _keys_and_predecessors(positions, mesh)
     acyclic = _move_behind_predecessors(keys, predecessors, mesh.topology.cell_adjacency)
-    return CellOrder(_argsort(keys[:-1]), acyclic and is_convex(mesh.vertices, mesh.topology))
+    return CellOrder(torch.argsort(keys[:-1]), acyclic and is_convex(mesh.vertices, mesh.topology))
 
 
 def _in_unit_range(vertices: torch.Tensor) -> torch.Tensor:
@@ -93,30 +98,33 @@ def _keys_and_predecessors(positions: torch.Tensor, mesh: TetMesh) -> tuple[torc
         keys: (T + 1,) int64; the last belongs to no cell, and is below all others.
         predecessors: (T, 4) int64, the cell across the face opposite local vertex k if it is nearer, else T.
     """
+    noise = positions.abs().max() * torch.finfo(mesh.vertices.dtype).eps
     count, tets, adjacency = mesh.num_cells, mesh.tets, mesh.topology.cell_adjacency
     keys = torch.full((count + 1,), _FIRST, dtype=torch.int64, device=tets.device)
     predecessors = torch.empty((count, 4), dtype=torch.int64, device=tets.device)
-    for part in chunks(count, tets.device, width=12):
+    for part in chunks(count, tets.device, width=4):
         cells = CellShape.of(positions, tets[part])
-        keys[part] = _ordered_bits(_eye_powers(cells))
+        keys[part] = _ordered_bits(_eye_powers(cells, noise))
         neighbors = adjacency[part]
         predecessors[part] = torch.where(_eye_is_beyond(cells).t() & (neighbors >= 0), neighbors, count)
     return keys, predecessors
 
 
-def _eye_powers(cells: CellShape) -> torch.Tensor:
+def _eye_powers(cells: CellShape, noise: torch.Tensor) -> torch.Tensor:
     """(N,) power of the eye with respect to each circumsphere, |center|^2 - radius^2.
 
-    Where the centre is far off, the sphere around the centroid with the mean square distance of the corners stands in.
+    Where `noise` in the positions moves the centre by a good part of the cell's size, the sphere around the centroid with the mean square distance of the corners stands in,
+    if the eye's power is smaller there: a cell too far in front is soon moved back, one too far behind moves many.
     """
-    squares = cells.squares()
     diameters = cells.diameters()
-    powers = cells.origin.square().sum(0) + (cells.origin * diameters).sum(0)
-    spread = cells.edges.sum(0) / 4.0
-    radius_squared = squares.sum(0) / 4.0 - spread.square().sum(0)
-    stand_in = (cells.origin + spread).square().sum(0) - radius_squared
-    near = diameters.square().sum(0) <= (2.0 * _FAR_CENTER) ** 2 * squares.amax(0)
-    return torch.where(near, powers, torch.fmin(powers, stand_in))
+    powers = dot(cells.origin, cells.origin + diameters)
+    spread = sum(cells.edges[1:], cells.edges[0]) / 4.0
+    centroid = cells.origin + spread
+    stand_in = dot(centroid, centroid) + dot(spread, spread) - cells.squares.sum(0) / 4.0
+    longest = cells.squares.amax(0).sqrt()
+    sizes = dot(diameters, diameters).sqrt() + longest
+    sure = (noise * sizes * longest < SURE * cells.determinants) & (sizes < FARC * longest)
+    return torch.where(sure, powers, torch.fmin(powers, stand_in))
 
 
 def _eye_is_beyond(cells: CellShape) -> torch.Tensor:
@@ -124,12 +132,11 @@ def _eye_is_beyond(cells: CellShape) -> torch.Tensor:
 
     Cells that rounding turned inside out do not know in from out and say False.
     """
-    through_origin = (cells.normals * cells.origin).sum(1)
-    opposite = -(through_origin.sum(0) + cells.determinants)
-    distances = torch.cat((opposite[None], through_origin))
-    longest = cells.squares().amax(0).sqrt()
-    reach = torch.linalg.vector_norm(cells.origin, dim=0) + longest
-    certain = distances > _SIGN_CERTAIN * longest * reach.square()
+    beside = [dot(normal, cells.origin) for normal in cells.normals]
+    opposite = -(sum(beside, cells.determinants))
+    longest = cells.squares.amax(0).sqrt()
+    reach = dot(cells.origin, cells.origin).sqrt() + longest
+    certain = torch.stack((opposite, *beside)) > _SIGN_CERTAIN * longest * reach.square()
     return certain & (cells.determinants > 0)
 
 
@@ -142,32 +149,65 @@ def _ordered_bits(values: torch.Tensor) -> torch.Tensor:
 def _move_behind_predecessors(keys: torch.Tensor, predecessors: torch.Tensor, adjacency: torch.Tensor) -> bool:
     """Raise keys, in place, by as little as makes each greater than those of all its predecessors.
 
+    Cells that moved pass it on to those behind them. That is quick if few do; otherwise all cells take their turn.
+
     Returns:
         Whether that succeeded; it cannot where predecessors form a cycle.
     """
     count = predecessors.shape[0]
     parts = [torch.arange(p.start, p.stop, device=keys.device) for p in chunks(count, keys.device, width=4)]
     moved = torch.cat([_raise(keys, predecessors, cells) for cells in parts])
+    moves = 0
     for _ in range(_MAX_ROUNDS):
         if not moved.numel():
             return True
-        behind = adjacency.index_select(0, moved)
-        reached = (behind >= 0) & (behind != predecessors.index_select(0, moved))
-        reached &= keys[behind] <= keys[moved][:, None]
-        cells = torch.unique_consecutive(sort_keys(behind[reached].long()))
+        if moves > _MAX_MOVES * count:
+            break
+        behind, before = _behind(predecessors, adjacency, moved)
+        late = true_indices(keys.index_select(0, behind) <= keys.index_select(0, before))
+        cells = torch.unique_consecutive(sort_keys(behind.index_select(0, late)))
         moved = _raise(keys, predecessors, cells)
-    return False
+        moves += moved.numel()
+    return _raise_in_turn(keys, predecessors, adjacency)
+
+
+def _raise_in_turn(keys: torch.Tensor, predecessors: torch.Tensor, adjacency: torch.Tensor) -> bool:
+    """Raise each key once, after those of all its predecessors.
+
+    Returns:
+        Whether all cells had their turn: those in and behind cycles have not.
+    """
+    count = predecessors.shape[0]
+    waiting_for = torch.cat([(predecessors[p] < count).sum(1) for p in chunks(count, keys.device, width=4)])
+    turn = true_indices(waiting_for == 0)
+    done = 0
+    while turn.numel():
+        done += turn.numel()
+        _raise(keys, predecessors, turn)
+        behind, before = _behind(predecessors, adjacency, turn)
+        # Where the eye is in the plane of a face, the neighbour waits for nothing.
+        waiting = predecessors.index_select(0, behind) == before[:, None]
+        behind = behind.index_select(0, true_indices(waiting.any(1)))
+        waiting_for.index_add_(0, behind, torch.full_like(behind, -1))
+        ready = behind.index_select(0, true_indices(waiting_for.index_select(0, behind) == 0))
+        turn = torch.unique_consecutive(sort_keys(ready))
+    return done == count
 
 
 def _raise(keys: torch.Tensor, predecessors: torch.Tensor, cells: torch.Tensor) -> torch.Tensor:
     """Put cells right behind the last of their predecessors if they are not behind it; returns those that moved."""
-    before = keys[predecessors.index_select(0, cells)].amax(1)
-    moving = before >= keys[cells]
-    # Cells without predecessors have the lowest key of all before them, and stay.
-    moved = cells[moving]
-    keys[moved] = before[moving] + 1
+    before = keys.index_select(0, predecessors.index_select(0, cells).view(-1)).view(-1, 4).amax(1)
+    # Without predecessors `before` is the lowest key there is, which no cell has.
+    moving = true_indices(before >= keys.index_select(0, cells))
+    moved = cells.index_select(0, moving)
+    put(keys, moved, before.index_select(0, moving) + 1)
     return moved
 
 
-def _argsort(keys: torch.Tensor) -> torch.Tensor:
-    return torch.argsort(keys)
+def _behind(
+    predecessors: torch.Tensor, adjacency: torch.Tensor, cells: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """The neighbours of `cells` that are not their predecessors, (N,) int64, and of which cells, (N,) int64."""
+    neighbors = adjacency.index_select(0, cells)
+    places = true_indices(((neighbors >= 0) & (neighbors != predecessors.index_select(0, cells))).view(-1))
+    return neighbors.view(-1).index_select(0, places).long(), cells.index_select(0, places >> 2)

@@ -207,9 +207,12 @@ class Clip:
     at_far: Any
 
     def start(self, entry: list[Any], leaving: list[Any]) -> list[Any]:
-        """Values where the part starts."""
-        return [dr.fma(self.first, v1 - v0, v0) for v0, v1 in zip(entry, leaving, strict=True)]
+        """Values where the part starts; exactly those where it ends if it is none."""
+        begins = self.first < 1.0
+        return [dr.select(begins, dr.fma(self.first, v1 - v0, v0), v1) for v0, v1 in zip(entry, leaving, strict=True)]
 
     def end(self, entry: list[Any], leaving: list[Any]) -> list[Any]:
         """Values where the part ends."""
-        return [dr.select(self.at_far, dr.fma(self.last, v1 - v0, v0), v1) for v0, v1 in zip(entry, leaving, strict=True)]
+        return [
+            dr.select(self.at_far, dr.fma(self.last, v1 - v0, v0), v1) for v0, v1 in zip(entry, leaving, strict=True)
+        ]

@@ -11,7 +11,7 @@ import torch
 
 from difftetvr.render.entry_table import FaceScene
 from difftetvr.render.rays import pixel_frame
-from difftetvr.render.walk import Corner, crossing_depth, holds_ray, make_face
+from difftetvr.render.walk import Corner, crossing_depth, holds_ray, interpolate, make_face
 
 _ITEM_PIXELS = 64  # a work item has about so many pixels, at most _ITEM_ROWS rows, and at least one
 _ITEM_ROWS = 8
@@ -46,24 +46,15 @@ class Hit:
     is_hit: Any
 
 
-@dataclass
-class _Boxes:
-    """First and last column and row of the pixels that may see each face, and whether there are any."""
-
-    columns: tuple[Any, Any]
-    rows: tuple[Any, Any]
-    visible: Any
-
-
 def work_items(scene: FaceScene, begin: int, end: int) -> WorkItems | None:
     """Work items of the faces from row ``begin`` to before ``end``, None if none of them is in sight."""
     backend, uint, integer = scene.backend, scene.backend.UInt, scene.backend.Int
     face = dr.arange(uint, end - begin) + backend.opaque_uint(begin)
-    boxes = _pixel_boxes(scene, face)
-    (row0, row1), (column0, column1) = boxes.rows, boxes.columns
+    points = [scene.point(vertex) for vertex in scene.indices(face)]
+    (column0, column1), (row0, row1), visible = pixel_range(scene, points)
     width = dr.fmax(scene.backend.Float(column1 - column0 + 1), 1.0)
     per_item = integer(dr.fmin(dr.fmax(_ITEM_PIXELS / width, 1.0), float(_ITEM_ROWS)))
-    count = dr.select(boxes.visible, (row1 - row0 + per_item) // per_item, 0)
+    count = dr.select(visible & _may_face_camera(points), (row1 - row0 + per_item) // per_item, 0)
     backend.run(count, row0, row1, column0, column1, per_item)
     counts = backend.tensor(count)
     owners = torch.repeat_interleave(
@@ -83,19 +74,23 @@ def work_items(scene: FaceScene, begin: int, end: int) -> WorkItems | None:
     return items
 
 
-def _pixel_boxes(scene: FaceScene, face: Any) -> _Boxes:
+def pixel_range(scene: FaceScene, points: list[list[Any]]) -> tuple[tuple[Any, Any], tuple[Any, Any], Any]:
+    """Pixels that may see the convex hull of some points in camera space.
+
+    Returns:
+        First and last column, first and last row, and whether there are any.
+    """
     real, pinhole = scene.backend.Float, scene.pinhole
     infinity = real(dr.inf)
     low, high = [infinity, infinity], [-infinity, -infinity]
     nearest, farthest = infinity, -infinity
-    points = [scene.point(vertex) for vertex in scene.indices(face)]
     for x, y, z in points:
         inverse = 1.0 / z
         for axis, value in enumerate((x * inverse * pinhole.fx + pinhole.cx, y * inverse * pinhole.fy + pinhole.cy)):
             low[axis] = dr.fmin(low[axis], value)
             high[axis] = dr.fmax(high[axis], value)
         nearest, farthest = dr.fmin(nearest, z), dr.fmax(farthest, z)
-    crosses = nearest <= 0  # part of the face lies behind the camera: its projection is unbounded
+    crosses = nearest <= 0  # part of the hull lies behind the camera: its projection is unbounded
     box = []
     for axis, size in enumerate((pinhole.width, pinhole.height)):
         last = real(size) - 1.0
@@ -103,9 +98,8 @@ def _pixel_boxes(scene: FaceScene, face: Any) -> _Boxes:
         begin = dr.select(crosses, 0.0, dr.fmin(dr.fmax(dr.ceil(low[axis] - (0.5 + _MARGIN)), 0.0), last + 1.0))
         end = dr.select(crosses, last, dr.fmin(dr.fmax(dr.floor(high[axis] - (0.5 - _MARGIN)), -1.0), last))
         box.append((scene.backend.Int(begin), scene.backend.Int(end)))
-    (columns, rows) = box
-    visible = (farthest > 0) & (columns[1] >= columns[0]) & (rows[1] >= rows[0]) & _may_face_camera(points)
-    return _Boxes(columns, rows, visible)
+    columns, rows = box
+    return columns, rows, (farthest > 0) & (columns[1] >= columns[0]) & (rows[1] >= rows[0])
 
 
 def _may_face_camera(points: list[list[Any]]) -> Any:
@@ -129,6 +123,7 @@ def for_each_hit(scene: FaceScene, items: WorkItems | None, visit: Callable[[Hit
         return
     vertices = scene.indices(items.face)
     points = [scene.point(vertex) for vertex in vertices]
+    passes_camera = dr.fmin(points[0][2], dr.fmin(points[1][2], points[2][2])) <= 0
 
     def body(column: Any, row: Any) -> tuple[Any, Any]:
         frame = pixel_frame(scene.pinhole, column, row)
@@ -137,8 +132,11 @@ def for_each_hit(scene: FaceScene, items: WorkItems | None, visit: Callable[[Hit
             a, b, t = frame.project(*point)
             corners.append(Corner(vertex, a, b, [t], []))
         face = make_face(corners)
-        depth = crossing_depth(face)
-        visit(Hit(column, row, items.face, depth, holds_ray(face) & (depth > 0)))
+        # Only where some corners lie behind the camera, the sign of the distance is in doubt and must be the exact one.
+        exact = lambda face: crossing_depth(face)  # noqa: E731
+        simple = lambda face: interpolate(face)[0]  # noqa: E731
+        depth = dr.if_stmt((face,), passes_camera, exact, simple)
+        visit(Hit(column, row, items.face, depth, holds_ray(face) & (~passes_camera | (depth > 0))))
         ends = column == items.last_column
         return dr.select(ends, items.first_column, column + 1), dr.select(ends, row + 1, row)
 
