@@ -1,7 +1,7 @@
 """Differentiable volume rendering of tetrahedral meshes.
 
 From a mesh with colour and density and a camera to an image, and from the derivative of a loss on that image back to
-colours, densities, vertex positions and camera poses; from images to a tetrahedral volume.
+colours, densities, transfer functions, vertex positions and camera poses; from images to a tetrahedral volume.
 """
 
 from difftetvr.capture import Capture, TransferFunction, Volume, VolumeCapture, load_capture
@@ -9,7 +9,7 @@ from difftetvr.errors import BackendError, CameraError, CaptureError, DiffTetErr
 from difftetvr.fit import FitConfig, FitError, FitResult, fit
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.mesh.io import load, load_mesh, save
-from difftetvr.render import Camera, RenderedImage, render
+from difftetvr.render import Camera, RenderedImage, ScalarField, render
 
 __all__ = [
     "BackendError",
@@ -24,6 +24,7 @@ __all__ = [
     "FitResult",
     "MeshError",
     "RenderedImage",
+    "ScalarField",
     "TetMesh",
     "TransferFunction",
     "Volume",

@@ -2,5 +2,7 @@
 
 from difftetvr.render.api import RenderedImage, render
 from difftetvr.render.camera import Camera
+from difftetvr.render.projected import OrderWarning
+from difftetvr.render.scalar_field import ScalarField
 
-__all__ = ["Camera", "RenderedImage", "render"]
+__all__ = ["Camera", "OrderWarning", "RenderedImage", "ScalarField", "render"]

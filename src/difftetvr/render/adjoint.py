@@ -24,6 +24,7 @@ from difftetvr.render.crossing import (
     inverse_length,
     read_vertex,
 )
+from difftetvr.render.transfer import CrossingAdjoint, Piece, PieceAdjoint, TransferGradients
 from difftetvr.render.walk import Corner, Face
 
 _EXPAND_BUDGET = 1 << 30  # bytes of per-thread gradient copies; beyond it threads share one copy through atomics
@@ -51,15 +52,17 @@ class Gradients:
     """Flat gradient buffers.
 
     Attributes:
-        field: (N, 4): red, green, blue, density of at least V vertices or T cells.
+        field: (N, 4): red, green, blue, density of at least V vertices or T cells; or (N,) scalars of vertices.
         vertices: (N, 4): x, y, z in camera space and padding; None if positions need no gradient.
         limits: (H, W, 2): the distances between which rays are looked at; None if they need no gradient.
+        transfer: The transfer function; None if there is none.
         mode: How additions of several rays to one record are reduced.
     """
 
     field: Any
     vertices: Any | None
     limits: Any | None
+    transfer: TransferGradients | None
     mode: dr.ReduceMode
 
 
@@ -124,14 +127,18 @@ def render_adjoint(tracer: Tracer, image: ImageAdjoint, vertex_count: int, wante
     real = view.backend.Float
     field_count = buffer_length(vertex_count if view.cells is None else dr.width(view.cells) // 4)
     position_count = buffer_length(vertex_count) if wanted.vertices else 0
+    transfer = None
+    if view.transfer is not None:
+        transfer = TransferGradients(*(dr.zeros(real, dr.width(a)) for a in (view.transfer.knots, view.transfer.values)))
     gradients = Gradients(
-        dr.zeros(real, 4 * field_count),
+        dr.zeros(real, field_count if transfer else 4 * field_count),
         dr.zeros(real, 4 * position_count) if wanted.vertices else None,
         dr.zeros(real, dr.width(view.limits)) if wanted.limits else None,
+        transfer,
         reduce_mode(view, 4 * (field_count + position_count)),
     )
     tracer.trace(lambda rays: _AdjointKernel(tracer, rays, image, gradients))
-    view.backend.run(gradients.field, gradients.vertices, gradients.limits)
+    view.backend.run(gradients.field, gradients.vertices, gradients.limits, gradients.transfer)
     return gradients
 
 
@@ -150,8 +157,9 @@ class _AdjointKernel:
             self.pixel.distance = dr.gather(backend.Float, image.distance, pixel, valid)
             far = dr.gather(backend.Float, image.out_distance, pixel, valid)
             self.rest = dr.fma(self.pixel.distance, far, self.rest)
-        # Accumulators of a vertex: density, radiance, and its position in the ray's frame; cells take the first two.
-        self.field_slots = 0 if self.view.cells is not None else 2
+        # Accumulators of a vertex: its scalar, or density and radiance, then its position in the ray's frame; for
+        # fields on cells only the position.
+        self.field_slots = 0 if self.view.cells is not None else 1 if self.view.transfer is not None else 2
         self.slots = self.field_slots + (3 if gradients.vertices is not None else 0)
 
     def start(self) -> AdjointRay:
@@ -161,8 +169,9 @@ class _AdjointKernel:
 
     def read(self, vertex: Any, active: Any) -> Corner:
         position, attributes = read_vertex(self.view, vertex, active)
-        values = [attributes[0], self._radiance(attributes[1:])] if attributes else []
-        return corner_of(self.rays.frame, vertex, position, values, self.slots)
+        if len(attributes) > 1:
+            attributes = [attributes[0], self._radiance(attributes[1:])]
+        return corner_of(self.rays.frame, vertex, position, attributes, self.slots)
 
     def _radiance(self, color: list[Any]) -> Any:
         g = self.pixel.color
@@ -177,7 +186,7 @@ class _AdjointKernel:
             record = dr.gather(self.view.backend.Float4, self.view.cells, step.cell)
             constant = [record[3], self._radiance([record[0], record[1], record[2]])]
             start, end = [start[0], *constant], [end[0], *constant]
-        ray, at_start, at_end = self._cross(start, end, ray)
+        ray, at_start, at_end = self._cross(start, end, ray) if self.view.transfer is None else self._cut(start, end, ray)
         if self.view.cells is not None:
             self._scatter_field(step.cell, at_start[1] + at_end[1], at_start[2] + at_end[2], True)
             at_start, at_end = at_start[:1], at_end[:1]
@@ -215,8 +224,24 @@ class _AdjointKernel:
         at_start, at_end = [d_t0, d_s0, w0], [d_t1, d_s1, w1]
         return AdjointRay(ray.transmittance * transmittance, rest, ray.carry, ray.limits), at_start, at_end
 
+    def _cut(self, start: list[Any], end: list[Any], ray: AdjointRay) -> tuple[AdjointRay, list[Any], list[Any]]:
+        """Adjoint of one cell, piece by piece: derivatives with respect to (distance, scalar) at its start and end."""
+        transfer, gradients = self.view.transfer, self.gradients.transfer
+        assert transfer is not None and gradients is not None
+
+        def visit(piece: Piece, state: tuple[AdjointRay, CrossingAdjoint]) -> tuple[AdjointRay, CrossingAdjoint]:
+            ray, total = state
+            ends = [[v[0], v[1], self._radiance(v[2:])] for v in (piece.start_values, piece.end_values)]
+            ray, at_start, at_end = self._cross(ends[0], ends[1], ray)
+            adjoint = PieceAdjoint(piece, start, end, gradients, self.gradients.mode)
+            return ray, adjoint.add(at_start, at_end, self.pixel.color, total)
+
+        zeros = lambda: [dr.zeros_like(ray.rest) for _ in range(2)]  # noqa: E731
+        ray, total = transfer.cut(start, end, visit, (ray, CrossingAdjoint(zeros(), zeros())))
+        return ray, total.entry, total.leaving
+
     def leave(self, face: Face, ray: AdjointRay, active: Any) -> AdjointRay:
-        carry = ray.carry[:1] if self.view.cells is not None else ray.carry
+        carry = ray.carry[: 1 + self.field_slots]
         self._distribute(face, carry)
         for corner in face.corners:
             self._scatter(corner.vertex, corner.adjoints, active)
@@ -243,7 +268,9 @@ class _AdjointKernel:
             corner.adjoints[first + 2] = dr.fma(weight, crossing[0], corner.adjoints[first + 2])
 
     def _scatter(self, vertex: Any, adjoints: list[Any], active: Any) -> None:
-        if self.field_slots:
+        if self.field_slots == 1:
+            dr.scatter_add(self.gradients.field, adjoints[0], vertex, active, mode=self.gradients.mode)
+        elif self.field_slots:
             self._scatter_field(vertex, adjoints[0], adjoints[1], active)
         if self.gradients.vertices is not None:
             position = self.rays.frame.to_camera_space(*adjoints[self.field_slots :])

@@ -13,9 +13,10 @@ from difftetvr.backend import backend_for
 from difftetvr.errors import DiffTetError, MeshError
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.optics import ConstantPerCell, ExactLinear, OpticalModel
-from difftetvr.render.autograd import TRACERS, RenderFunction, RenderTask
+from difftetvr.render.autograd import TRACERS, Content, RenderFunction, RenderTask
 from difftetvr.render.camera import Camera
 from difftetvr.render.clip_plane import clip_limits
+from difftetvr.render.scalar_field import ScalarField
 
 RENDERERS = tuple(TRACERS)
 _SMALL = 1e-6  # within this and its inverse, coordinates are left as they are
@@ -40,7 +41,7 @@ class RenderedImage:
 
 def render(
     mesh: TetMesh,
-    field: Field,
+    field: Field | ScalarField,
     camera: Camera,
     background: torch.Tensor | tuple[float, float, float] | None = None,
     renderer: str = "marching",
@@ -51,12 +52,13 @@ def render(
 ) -> RenderedImage:
     """Render a tetrahedral mesh by emission and absorption (article section 3, solved exactly).
 
-    Differentiable once in ``mesh.vertices``, ``field.color``, ``field.density``, ``camera.world_to_camera``,
-    ``background`` and ``clip_plane``, as far as these require gradients. Runs on the device and at the precision of ``mesh.vertices``.
+    Differentiable once in ``mesh.vertices``, the field's tensors (those of its transfer function, too),
+    ``camera.world_to_camera``, ``background`` and ``clip_plane``, as far as these require gradients. Runs on the device and at the precision of ``mesh.vertices``.
 
     Args:
         mesh: Tetrahedral mesh; its vertices' device and dtype (float32 or float64) decide where and how to render.
-        field: Colour and density per vertex (linear inside each cell) or per cell (constant).
+        field: Colour and density per vertex (linear inside each cell) or per cell (constant); or scalars likewise, with
+            a transfer function.
         camera: Pinhole camera, inside or outside of the mesh.
         background: (3,) linear RGB behind the volume; black if None.
         renderer: How crossings are found and ordered. ``"marching"`` walks from cell to cell; ``"linked-list"`` sorts
@@ -82,7 +84,7 @@ def render(
     view = prepare_view(mesh, field, camera, optics, transmittance_threshold, deterministic, renderer)
     behind = as_background(background, mesh.vertices)
     limits = None if clip_plane is None else clip_limits(clip_plane, camera, mesh.vertices) / view.unit
-    light, distance = RenderFunction.apply(view.task, view.vertices, view.color, view.density, limits)
+    light, distance = RenderFunction.apply(view.task, view.vertices, limits, *view.parts)
     return compose(light, _times(distance, view.unit), behind)
 
 
@@ -93,21 +95,19 @@ class PreparedView:
     Attributes:
         task: What it needs besides tensors that may require gradients.
         vertices: (V, 3) in camera space, in a unit in which products neither vanish nor overflow.
-        color: (N, 3) linear RGB.
-        density: (N,) in that unit.
+        parts: What the volume holds, see :data:`difftetvr.render.autograd.Content`; densities are in that unit.
         unit: The unit, in world units.
     """
 
     task: RenderTask
     vertices: torch.Tensor
-    color: torch.Tensor
-    density: torch.Tensor
+    parts: tuple[torch.Tensor, ...]
     unit: float
 
 
 def prepare_view(
     mesh: TetMesh,
-    field: Field,
+    field: Field | ScalarField,
     camera: Camera,
     optics: OpticalModel | None,
     transmittance_threshold: float,
@@ -117,20 +117,33 @@ def prepare_view(
     """Check a view's inputs and bring them into camera space; arguments and errors are those of :func:`render`."""
     if not 0.0 <= transmittance_threshold < 1.0:
         raise DiffTetError(f"transmittance_threshold is {transmittance_threshold}; it must lie in [0, 1).")
-    per_cell = field.location_on(mesh) == "cell"
-    for name, tensor in (("color", field.color), ("density", field.density)):
+    content, parts = _content(mesh, field)
+    for tensor in parts:
         if tensor.device != mesh.vertices.device:
-            raise MeshError(
-                f"The field's {name} is on '{tensor.device}', the mesh on '{mesh.vertices.device}'; move one of them."
-            )
+            raise MeshError(f"The field is on '{tensor.device}', the mesh on '{mesh.vertices.device}'; move one of them.")
     backend = backend_for(mesh.vertices)
-    field = field.to(dtype=backend.dtype)
-    field.validate(mesh)
+    parts = tuple(part.to(backend.dtype) for part in parts)
+    if content != "scalar":
+        Field(*parts, content).validate(mesh)
     if optics is None:
-        optics = ConstantPerCell() if per_cell else ExactLinear()
-    task = RenderTask(backend, mesh, camera, optics, per_cell, transmittance_threshold, deterministic, renderer)
+        optics = ConstantPerCell() if content == "cell" else ExactLinear()
+    task = RenderTask(backend, mesh, camera, optics, content, transmittance_threshold, deterministic, renderer)
     vertices, unit = _unit_of_length(camera.to_camera_space(mesh.vertices), mesh)
-    return PreparedView(task, vertices, field.color, _times(field.density, unit), unit)
+    if unit != 1.0 and content == "scalar":
+        parts = *parts[:2], torch.cat((parts[2][:, :1] * unit, parts[2][:, 1:]), dim=1)
+    elif unit != 1.0:
+        parts = parts[0], parts[1] * unit
+    return PreparedView(task, vertices, parts, unit)
+
+
+def _content(mesh: TetMesh, field: Field | ScalarField) -> tuple[Content, tuple[torch.Tensor, ...]]:
+    """What the volume holds, and its tensors as they are."""
+    location = field.location_on(mesh)
+    if isinstance(field, ScalarField):
+        if location == "vertex":
+            return "scalar", (field.normalised(), *field.knots(mesh.vertices))
+        field = field.as_field()
+    return location, (field.color, field.density)
 
 
 def as_background(background: Any, like: torch.Tensor) -> torch.Tensor | None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch.autograd.function import once_differentiable
@@ -18,6 +19,11 @@ from difftetvr.render.forward import render_forward
 from difftetvr.render.linked_list import LinkedList
 from difftetvr.render.marching import Marching
 from difftetvr.render.projected import Projected
+from difftetvr.render.transfer import Transfer
+
+Content = Literal["vertex", "cell", "scalar"]
+"""What a volume holds: (V, 3) colours and (V,) densities on vertices, (T, 3) and (T,) on cells, or (V,) scalars, (K,)
+knots and (K, 4) densities and colours of their transfer function."""
 
 TRACERS: dict[str, Any] = {"marching": Marching, "linked-list": LinkedList, "projected": Projected}
 """How crossings are found and ordered, by the name of the renderer."""
@@ -31,35 +37,39 @@ class RenderTask:
     mesh: TetMesh
     camera: Camera
     optics: OpticalModel
-    per_cell: bool
+    content: Content
     threshold: float
     deterministic: bool
     renderer: str = "marching"
 
-    def tracer(
-        self, vertices: torch.Tensor, color: torch.Tensor, density: torch.Tensor, limits: torch.Tensor | None = None
-    ) -> Tracer:
+    def tracer(self, vertices: torch.Tensor, limits: torch.Tensor | None, parts: Sequence[torch.Tensor]) -> Tracer:
         """Upload a view.
 
         Args:
             vertices: (V, 3) in camera space.
-            color: (N, 3) of vertices or cells.
-            density: (N,) likewise.
             limits: (H, W, 2) distances between which each ray is looked at; None for all in front of the camera.
+            parts: What the volume holds, see :data:`Content`.
         """
         backend = self.backend
-        if self.per_cell:
-            records = backend.floats(torch.cat([vertices, vertices.new_zeros(vertices.shape[0], 1)], dim=1))
+        cells = transfer = None
+        if self.content == "vertex":
+            color, density = parts
+            records = vertex_records(backend, *(backend.floats(part) for part in (vertices, density, color)))
+        elif self.content == "cell":
+            color, density = parts
+            records = _with_fourth(backend, vertices, vertices.new_zeros(vertices.shape[0]))
             cells = backend.floats(torch.cat([color, density[:, None]], dim=1))
         else:
-            records = vertex_records(backend, *(backend.floats(part) for part in (vertices, density, color)))
-            cells = None
+            scalar, knots, values = parts
+            records = _with_fourth(backend, vertices, scalar)
+            transfer = Transfer.of(backend, knots, values)
         view = View(
             backend,
             self.camera,
             self.optics,
             records,
             cells,
+            transfer,
             backend.opaque(self.threshold),
             None if limits is None else backend.floats(limits),
         )
@@ -67,23 +77,28 @@ class RenderTask:
         return tracer
 
 
-class RenderFunction(torch.autograd.Function):
-    """(V, 3) camera-space vertices, colours, densities, limits to (H, W, 4) radiance and optical depth, (H, W) distance.
+def _with_fourth(backend: Backend, vertices: torch.Tensor, values: torch.Tensor) -> Any:
+    """Flat (V, 4) records of positions and one value each."""
+    return backend.floats(torch.cat([vertices, values[:, None]], dim=1))
 
-    Colours, densities and limits are those of :meth:`RenderTask.tracer`.
+
+class RenderFunction(torch.autograd.Function):
+    """From vertices in camera space, limits and content to (H, W, 4) radiance and optical depth, (H, W) distance.
+
+    The inputs are those of :meth:`RenderTask.tracer`.
     """
 
     @staticmethod
-    def forward(ctx: Any, task: RenderTask, vertices: Any, color: Any, density: Any, limits: Any) -> Any:
+    def forward(ctx: Any, task: RenderTask, vertices: Any, limits: Any, *parts: Any) -> Any:
         """Render; keeps only the image and, while gradients are wanted, the uploaded view."""
         size = (task.camera.height, task.camera.width)
         with task.backend.exclusive():
-            tracer = task.tracer(vertices, color, density, limits)
+            tracer = task.tracer(vertices, limits, parts)
             light, distance = render_forward(tracer)
             image = task.backend.tensor(light, *size, 4), task.backend.tensor(distance, *size)
         ctx.set_materialize_grads(False)
         ctx.task, ctx.tracer = task, tracer
-        ctx.vertex_count, ctx.field_count = vertices.shape[0], density.shape[0]
+        ctx.vertex_count, ctx.part_size = vertices.shape[0], parts[0].shape[0]
         ctx.save_for_backward(*image)
         return image
 
@@ -93,7 +108,7 @@ class RenderFunction(torch.autograd.Function):
         """Go through the crossings again with the image's derivatives."""
         backend = ctx.task.backend
         light, distance = ctx.saved_tensors
-        needs_vertices, needs_color, needs_density, needs_limits = ctx.needs_input_grad[1:]
+        needs_vertices, needs_limits = ctx.needs_input_grad[1:3]
         with backend.exclusive(one_thread=ctx.task.deterministic):
             image = ImageAdjoint(
                 backend.floats(torch.zeros_like(light) if g_light is None else g_light),
@@ -101,11 +116,15 @@ class RenderFunction(torch.autograd.Function):
                 backend.floats(light),
                 backend.floats(distance),
             )
-            wanted = Wanted(needs_vertices, needs_limits)
-            gradients = render_adjoint(ctx.tracer, image, ctx.vertex_count, wanted)
-            field = backend.tensor(gradients.field).reshape(-1, 4)[: ctx.field_count]
-            vertices = backend.tensor(gradients.vertices).reshape(-1, 4)[:, :3] if needs_vertices else None
+            gradients = render_adjoint(ctx.tracer, image, ctx.vertex_count, Wanted(needs_vertices, needs_limits))
+            vertices = backend.tensor(gradients.vertices).reshape(-1, 4)[: ctx.vertex_count, :3] if needs_vertices else None
             limits = backend.tensor(gradients.limits, *distance.shape, 2) if needs_limits else None
-        if vertices is not None:
-            vertices = vertices[: ctx.vertex_count]
-        return None, vertices, field[:, :3] if needs_color else None, field[:, 3] if needs_density else None, limits
+            parts: tuple[torch.Tensor, ...]
+            if gradients.transfer is None:
+                field = backend.tensor(gradients.field).reshape(-1, 4)[: ctx.part_size]
+                parts = field[:, :3], field[:, 3]
+            else:
+                values = backend.tensor(gradients.transfer.values).reshape(-1, 4)
+                parts = backend.tensor(gradients.field)[: ctx.part_size], backend.tensor(gradients.transfer.knots), values
+        wanted = (part if needed else None for part, needed in zip(parts, ctx.needs_input_grad[3:], strict=True))
+        return None, vertices, limits, *wanted

@@ -16,6 +16,7 @@ import drjit as dr
 from difftetvr.backend import Backend
 from difftetvr.optics import OpticalModel
 from difftetvr.render.camera import Camera
+from difftetvr.render.transfer import Transfer
 from difftetvr.render.rays import Frame, Pinhole, lane_count, lane_pixel, pixel_frame
 from difftetvr.render.walk import Corner, Exit, Face, find_exit, interpolate, make_face
 
@@ -28,9 +29,10 @@ class View:
         backend: Array types.
         camera: Image size (the intrinsics are read from the device).
         optics: Optical model of one cell.
-        vertices: Vertex records: (V, 4) x, y, z in camera space and 0 for per-cell fields, else (V, 8) x, y, z,
-            density, linear RGB and 0, so that one cache line holds all of a vertex.
+        vertices: Vertex records: (V, 4) x, y, z in camera space and the scalar, 0 for per-cell fields; or (V, 8)
+            x, y, z, density, linear RGB and 0, so that one cache line holds all of a vertex.
         cells: (T, 4) linear RGB and density for per-cell fields, else None.
+        transfer: Transfer function of the vertices' scalars, None where vertices have densities and colours.
         threshold: Transmittance below which a ray stops, as a device value.
         limits: (H, W, 2) distances between which each ray is looked at, None for all in front of the camera.
     """
@@ -40,6 +42,7 @@ class View:
     optics: OpticalModel
     vertices: Any
     cells: Any | None
+    transfer: Transfer | None
     threshold: Any
     limits: Any | None
 
@@ -148,8 +151,11 @@ def cross_cell(kernel: Kernel, cell: Any, vertices: list[Any], ray: Any, active:
 
 
 def read_vertex(view: View, vertex: Any, active: Any) -> tuple[Any, list[Any]]:
-    """A vertex's position record and its attributes: density and linear RGB, or none for per-cell fields."""
+    """A vertex's position record and its attributes: density and linear RGB, a scalar, or none for per-cell fields."""
     float4 = view.backend.Float4
+    if view.transfer is not None:
+        position = dr.gather(float4, view.vertices, vertex, active)
+        return position, [position[3]]
     if view.cells is not None:
         return dr.gather(float4, view.vertices, vertex, active), []
     position = dr.gather(float4, view.vertices, 2 * vertex, active)

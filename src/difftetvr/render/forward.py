@@ -66,6 +66,9 @@ class _ForwardKernel:
         if self.view.cells is not None:
             record = dr.gather(self.view.backend.Float4, self.view.cells, step.cell)
             entry, leaving = ([values[0], record[3], record[0], record[1], record[2]] for values in (entry, leaving))
+        if self.view.transfer is not None:
+            pass_piece = lambda piece, ray: self._gather(piece.start_values, piece.end_values, ray)  # noqa: E731
+            return self.view.transfer.cut(entry, leaving, pass_piece, ray)
         return self._gather(entry, leaving, ray)
 
     def _gather(self, entry: list[Any], leaving: list[Any], ray: Radiance) -> Radiance:

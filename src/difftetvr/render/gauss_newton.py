@@ -180,7 +180,7 @@ def model_image(
     behind = as_background(background, mesh.vertices)
     backend, size = view.task.backend, (camera.height, camera.width)
     with backend.exclusive(one_thread=deterministic):
-        tracer = view.task.tracer(view.vertices, view.color, view.density)
+        tracer = view.task.tracer(view.vertices, None, view.parts)
         light, distance = render_forward(tracer)
         image = compose(backend.tensor(light, *size, 4), backend.tensor(distance, *size), behind).color
         residual = image - truth.to(image)
