@@ -1,6 +1,7 @@
 """Half-edge collapse and the link condition, held against slow loops over sets."""
 
 import itertools
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -10,10 +11,10 @@ from mesh.changes import SEEDS, check_change, random_mesh
 from scipy.spatial import ConvexHull
 
 from difftetvr.errors import MeshError
-from difftetvr.mesh import TetMesh, Topology
+from difftetvr.mesh import TetMesh, Topology, collapse
 from difftetvr.mesh.bisection import bisect_edges, independent_edges
 from difftetvr.mesh.collapse import collapse_edges
-from difftetvr.mesh.independent import best_first
+from difftetvr.mesh.independent import BestFirst, best_first
 from difftetvr.mesh.link import link_condition
 
 
@@ -58,6 +59,18 @@ def test_link_condition_of_spheres_and_meshes(seed):
     expected = [link(u) & link(v) == link(u, v) for u, v in pairs.tolist()]
     assert link_condition(topology, pairs).tolist() == expected
     assert link_condition(topology, pairs.flip(1)).tolist() == expected
+
+
+@pytest.mark.parametrize("around", [3, 4, 5, 16, 17, 40])
+def test_link_condition_of_many_vertices_around_an_edge(around):
+    """Two circles joined to a 3-sphere: all vertices of the one are around each edge of the other."""
+    for size in (3, 4):
+        cells = [(i, (i + 1) % size, size + j, size + (j + 1) % around) for i in range(size) for j in range(around)]
+        topology = Topology(torch.tensor(cells).int(), size + around)
+        link, pairs = links(topology), topology.edges.long()
+        expected = [link(u) & link(v) == link(u, v) for u, v in pairs.tolist()]
+        assert link_condition(topology, pairs).tolist() == expected
+        assert pairs[0].tolist() == [0, 1] and expected[0] == (size > 3)
 
 
 def test_spheres_fail_in_every_dimension():
@@ -144,6 +157,33 @@ def test_collapses_are_those_of_the_greedy_loop(seed):
         assert change.parents[:, 0][change.mesh.tets.long()].tolist() == remaining
         assert [merged[i] for i in change.cell_parents] == remaining
         assert limit is None or mesh.num_cells - len(remaining) <= limit
+
+
+@settings(max_examples=5, deadline=None)
+@given(seed=SEEDS)
+def test_it_makes_no_difference_how_many_candidates_are_looked_at_together(seed):
+    mesh = interior_mesh(seed)
+    for limit in (10, mesh.num_cells // 4, mesh.num_cells):
+        halves = all_half_edges(mesh, seed, distinct=seed % 2 == 0)
+        change = collapse_edges(mesh, *halves, limit=limit, boundary="slide")
+        with mock.patch.multiple(collapse, _SMALLEST_BATCH=20, _CELLS_PER_COLLAPSE=1000):
+            in_parts = collapse_edges(mesh, *halves, limit=limit, boundary="slide")
+        assert torch.equal(in_parts.mesh.tets, change.mesh.tets)
+        assert torch.equal(in_parts.parents, change.parents)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.int64])
+def test_best_first_part_by_part(dtype):
+    generator = torch.Generator().manual_seed(0)
+    for count in (0, 1, 2, 1000):
+        priority = torch.randn(count, generator=generator).mul(3).round().to(dtype)
+        queue, parts = BestFirst(priority), [torch.zeros(0, dtype=torch.int64)]
+        while left := len(queue):
+            parts.append(queue.take(100))
+            assert len(parts[-1]) >= min(left, 100) and len(queue) == left - len(parts[-1])
+        together = torch.cat(parts)
+        assert torch.equal(together, best_first(priority))
+        assert torch.equal(priority[together], priority.sort(descending=True).values)
 
 
 @settings(max_examples=10, deadline=None)

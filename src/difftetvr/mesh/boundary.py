@@ -8,7 +8,7 @@ import torch
 
 from difftetvr.mesh import quality
 from difftetvr.mesh.arrays import true_indices
-from difftetvr.mesh.incidence import boundary_vertices, stars
+from difftetvr.mesh.incidence import boundary_vertices, shell, stars
 from difftetvr.mesh.shapes import length_scale
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.mesh.topology import Topology
@@ -100,7 +100,9 @@ def removable_vertices(mesh: TetMesh, slide: bool, tolerance: float = 1e-4) -> t
     return removable
 
 
-def keeps_surface(mesh: TetMesh, half_edges: torch.Tensor, tolerance: float = 1e-4) -> torch.Tensor:
+def keeps_surface(
+    mesh: TetMesh, half_edges: torch.Tensor, tolerance: float = 1e-4, constraint: BoundaryConstraint | None = None
+) -> torch.Tensor:
     """Whether the boundary stays the same surface where one of its vertices v is merged into its neighbour u.
 
     It does if no cell gets inverted, which is not looked at here, and
@@ -115,11 +117,12 @@ def keeps_surface(mesh: TetMesh, half_edges: torch.Tensor, tolerance: float = 1e
         half_edges: (N, 2) vertices [v, u] on the boundary that share an edge.
         tolerance: Largest sine of an angle between directions and planes that are taken for parallel, and the largest
             share of volumes and areas that is taken for rounding.
+        constraint: `BoundaryConstraint.sliding(mesh, tolerance)`, where the caller has it already.
 
     Returns:
         (N,) bool.
     """
-    constraint = BoundaryConstraint.sliding(mesh, tolerance)
+    constraint = constraint or BoundaryConstraint.sliding(mesh, tolerance)
     positions = mesh.vertices.detach().double() * length_scale(mesh.vertices)
     half_edges = half_edges.long().t().contiguous()
     removed, kept = half_edges
@@ -127,25 +130,18 @@ def keeps_surface(mesh: TetMesh, half_edges: torch.Tensor, tolerance: float = 1e
     direction = positions[kept] - positions[removed]
     off = direction - (constraint.tangents[local] @ direction[:, :, None])[:, :, 0]
     keeps = torch.linalg.vector_norm(off, dim=1) <= tolerance * torch.linalg.vector_norm(direction, dim=1)
-
-    owner, cells = stars(mesh.topology, constraint.vertices)
-    volumes = quality.volumes(positions, mesh.tets[cells])
-    volume = volumes.new_zeros(constraint.vertices.shape[0]).index_add_(0, owner, volumes)[local]
-    # As cells with a vertex outside, boundary faces have tables of who is around a vertex.
-    faces = mesh.topology.boundary_faces
-    shell = Topology(torch.nn.functional.pad(faces, (0, 1), value=mesh.num_vertices), mesh.num_vertices + 1)
     for rows in true_indices(keeps).split(_PAIRS_AT_ONCE):
-        keeps[rows] = _keep_in_place(positions, shell, half_edges[:, rows], volume[rows], tolerance)
+        keeps[rows] = _keep_in_place(positions, mesh.topology, half_edges[:, rows], tolerance)
     return keeps
 
 
 def _keep_in_place(
-    positions: torch.Tensor, shell: Topology, half_edges: torch.Tensor, volume: torch.Tensor, tolerance: float
+    positions: torch.Tensor, topology: Topology, half_edges: torch.Tensor, tolerance: float
 ) -> torch.Tensor:
     """(N,) bool: boundary faces around v keep their area and sweep no volume; half_edges is (2, N) here."""
     removed, kept = half_edges
-    owner, rows = stars(shell, removed)
-    faces = shell.tets[rows, :3].long()
+    owner, rows = stars(shell(topology), removed)
+    faces = topology.boundary_faces[rows].long()
     moved = torch.where(faces == removed[owner, None], kept[owner, None], faces)
     before, after = _area_vectors(positions[faces]), _area_vectors(positions[moved])
     swept = ((positions[kept] - positions[removed])[owner] * before).sum(1).abs() / 6.0
@@ -153,7 +149,16 @@ def _keep_in_place(
     sums = positions.new_zeros((removed.shape[0], 3))
     sums.index_add_(0, owner, torch.stack((*lengths, swept), 1))
     area, area_after, swept = sums.unbind(1)
+    volume = _star_volumes(positions, topology, removed)
     return ((area_after - area).abs() <= tolerance * area) & (swept <= tolerance * volume)
+
+
+def _star_volumes(positions: torch.Tensor, topology: Topology, vertices: torch.Tensor) -> torch.Tensor:
+    """(N,) volume of the cells around vertices (N,), each of which may come several times."""
+    different, place = torch.unique(vertices, return_inverse=True)
+    owner, cells = stars(topology, different)
+    volumes = quality.volumes(positions, topology.tets[cells])
+    return volumes.new_zeros(different.shape[0]).index_add_(0, owner, volumes)[place]
 
 
 def _area_vectors(triangles: torch.Tensor) -> torch.Tensor:

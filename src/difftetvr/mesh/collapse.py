@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
 from typing import Literal
 
 import torch
@@ -10,10 +10,10 @@ import torch
 from difftetvr.errors import MeshError
 from difftetvr.mesh import quality
 from difftetvr.mesh.arrays import chunks, true_indices
-from difftetvr.mesh.boundary import keeps_surface
+from difftetvr.mesh.boundary import BoundaryConstraint, keeps_surface
 from difftetvr.mesh.change import MeshChange, check_indices, with_vertices_kept
-from difftetvr.mesh.incidence import boundary_vertices, stars
-from difftetvr.mesh.independent import best_first
+from difftetvr.mesh.incidence import boundary_vertices, is_corner, stars
+from difftetvr.mesh.independent import BestFirst
 from difftetvr.mesh.link import link_condition
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.mesh.topology import Topology
@@ -21,6 +21,8 @@ from difftetvr.mesh.topology import Topology
 _SMALLEST_BATCH = 2048
 _CELLS_PER_COLLAPSE = 4
 """How many cells a collapse is expected to remove; it decides the size of batches only, never the result."""
+_SLOWDOWN = 2.0
+"""How many times as many candidates as in the last batch are expected to be needed for each cell that vanishes."""
 
 
 def collapse_edges(
@@ -66,6 +68,15 @@ def collapse_edges(
     Raises:
         MeshError: An index is out of range, cost is NaN, lengths do not match, or an option is none of the above.
     """
+    _check(edges, target, cost, boundary, coplanarity)
+    edges = check_indices(edges, mesh.topology.edges.shape[0], "edge")
+    target = check_indices(target, 2, "target")
+    candidates = _Candidates(mesh, edges, target, coplanarity if boundary == "slide" else None)
+    chosen = _choose(mesh, BestFirst(-cost.detach()), candidates, limit, min_quality)
+    return _apply(mesh, _without_twins(mesh, chosen))
+
+
+def _check(edges: torch.Tensor, target: torch.Tensor, cost: torch.Tensor, boundary: str, coplanarity: float) -> None:
     if edges.ndim != 1 or target.shape != edges.shape or cost.shape != edges.shape:
         shapes = ", ".join(str(tuple(tensor.shape)) for tensor in (edges, target, cost))
         raise MeshError(f"Edges, target and cost have shapes {shapes}; pass three times (C,).")
@@ -76,57 +87,83 @@ def collapse_edges(
             f"The boundary is {boundary!r} with a coplanarity of {coplanarity}; pass 'fixed' or 'slide' and a number "
             "of at least 0 and below 1."
         )
-    edges = check_indices(edges, mesh.topology.edges.shape[0], "edge")
-    target = check_indices(target, 2, "target")
-    outer = boundary_vertices(mesh.topology)
 
-    def half_edges(places: torch.Tensor) -> torch.Tensor:
-        """(N, 2) int32, [vertex to remove, vertex to keep] of those that leave the boundary as it is."""
-        ends = mesh.topology.edges[edges[places]]
-        kept = ends.gather(1, target[places, None])
+
+class _Candidates:
+    """The collapses that a caller proposes, looked at only when it is their turn."""
+
+    def __init__(self, mesh: TetMesh, edges: torch.Tensor, target: torch.Tensor, coplanarity: float | None) -> None:
+        """No table is made yet but for the boundary's.
+
+        Args:
+            mesh: The mesh.
+            edges: (C,) int64, see `collapse_edges`.
+            target: (C,) int64, see `collapse_edges`.
+            coplanarity: See `collapse_edges`; None where vertices on the boundary stay.
+        """
+        self._mesh = mesh
+        self._edges = edges
+        self._target = target
+        self._outer = boundary_vertices(mesh.topology)
+        self._coplanarity = coplanarity
+        self._constraint = None if coplanarity is None else BoundaryConstraint.sliding(mesh, coplanarity)
+
+    def half_edges(self, places: torch.Tensor) -> torch.Tensor:
+        """Those that leave the boundary as it is.
+
+        Args:
+            places: (N,) int64 indices of candidates.
+
+        Returns:
+            (M, 2) int32, [vertex to remove, vertex to keep], in the order of `places`.
+        """
+        ends = self._mesh.topology.edges.index_select(0, self._edges.index_select(0, places))
+        kept = ends.gather(1, self._target.index_select(0, places)[:, None])
         removed = ends.sum(1, keepdim=True, dtype=ends.dtype) - kept
         pairs = torch.cat((removed, kept), 1)
-        movable = ~outer[pairs[:, 0].long()]
-        if boundary == "slide":
-            sliding = true_indices(~movable & outer[pairs[:, 1].long()])
-            movable[sliding] = keeps_surface(mesh, pairs[sliding], coplanarity)
+        movable = ~self._outer.index_select(0, pairs[:, 0])
+        if self._coplanarity is not None:
+            sliding = true_indices(~movable & self._outer.index_select(0, pairs[:, 1]))
+            movable[sliding] = keeps_surface(self._mesh, pairs[sliding], self._coplanarity, self._constraint)
         return pairs[movable]
-
-    queue = best_first(-cost.detach())
-    return _apply(mesh, _without_twins(mesh, _choose(mesh, queue, half_edges, limit, min_quality)))
 
 
 def _choose(
-    mesh: TetMesh,
-    queue: torch.Tensor,
-    half_edges: Callable[[torch.Tensor], torch.Tensor],
-    limit: int | None,
-    min_quality: float,
+    mesh: TetMesh, queue: BestFirst, candidates: _Candidates, limit: int | None, min_quality: float
 ) -> torch.Tensor:
     """Collapses (N, 2), [vertex to remove, vertex to keep], that are valid, independent and within the limit.
 
     Args:
         mesh: The mesh.
-        queue: (C,) int64 numbers of the candidates, best first.
-        half_edges: Gives the collapses (N, 2) of candidates, without those that would change the boundary.
+        queue: Numbers of the candidates.
+        candidates: What they are.
         limit: See `collapse_edges`.
         min_quality: See `collapse_edges`.
     """
-    blocked = torch.zeros(mesh.num_vertices, dtype=torch.bool, device=queue.device)
-    chosen, vanished, within = [half_edges(queue[:0])], 0, True
-    # With a limit the head of the queue is enough; it grows until the limit is reached.
-    batch = queue.shape[0] if limit is None else _SMALLEST_BATCH + limit // _CELLS_PER_COLLAPSE
-    while queue.shape[0] and within:
-        head, queue = queue[:batch], queue[batch:]
-        taken, counts = _choose_among(mesh, half_edges(head), blocked, min_quality)
-        if limit is not None:
-            fits = counts.cumsum(0) <= limit - vanished
-            within = bool(fits.all())
-            taken, counts = taken[fits], counts[fits]
+    blocked = torch.zeros(mesh.num_vertices, dtype=torch.bool, device=mesh.tets.device)
+    chosen, left, within = [mesh.tets[:0, :2]], limit, True
+    # With a limit the head of the queue is enough, which is looked at in batches until the limit is reached.
+    batch = len(queue) if limit is None else _SMALLEST_BATCH + max(limit, 0) // _CELLS_PER_COLLAPSE
+    while len(queue) and within:
+        head = queue.take(batch)
+        taken, counts = _choose_among(mesh, candidates.half_edges(head), blocked, min_quality)
+        if left is not None:
+            fits = counts.cumsum(0) <= left
+            vanished = int(counts[fits].sum())
+            taken, left = taken[fits], left - vanished
+            within = left > 0 and bool(fits.all())
+            batch = _next_batch(head.shape[0], vanished, left)
         chosen.append(taken)
-        vanished += int(counts.sum())
-        batch *= 2
     return torch.cat(chosen)
+
+
+def _next_batch(batch: int, vanished: int, left: int) -> int:
+    """How many candidates to look at next, if `batch` of them removed `vanished` cells and `left` more may vanish.
+
+    The later, the more of them are around vertices that others have changed already.
+    """
+    needed = batch * left * _SLOWDOWN / vanished if vanished else math.inf
+    return max(_SMALLEST_BATCH, int(min(2.0 * batch, needed)))
 
 
 def _choose_among(
@@ -147,58 +184,62 @@ def _choose_among(
     """
     count = queue.shape[0]
     removed = queue[:, 0].long()
-    degrees = torch.diff(mesh.topology.vertex_cells[0])
-    pending = true_indices(~blocked[removed])
+    pending = true_indices(~blocked.index_select(0, removed))
     removes = torch.zeros(count, dtype=torch.int64, device=queue.device)
-    groups = mesh.tets
+    edges = mesh.topology.edges
     while pending.shape[0]:
+        vertices = removed.index_select(0, pending)
         rank = torch.full((mesh.num_vertices,), count, dtype=torch.int32, device=queue.device)
-        rank.scatter_reduce_(0, removed[pending], pending.int(), "amin")
-        groups, first = _with_candidates(groups, rank, count)
-        wins = torch.bincount(first, minlength=count)
-        leaders = true_indices((wins > 0) & (wins == degrees[removed]))
-        valid, vanishing = _valid(mesh, queue[leaders], min_quality)
-        removes[leaders[valid]] = vanishing[valid]
-        _, around = stars(mesh.topology, removed[leaders[valid]])
-        blocked[mesh.tets[around].view(-1).long()] = True
-        blocked_now = blocked[removed[pending]]
-        pending = pending[~blocked_now & ~torch.isin(pending, leaders)]
+        rank.scatter_reduce_(0, vertices, pending.int(), "amin")
+        edges, later = _between_candidates(edges, rank, count)
+        leads = torch.zeros(count, dtype=torch.bool, device=queue.device)
+        leads[rank.index_select(0, vertices).long()] = True
+        leads[later.long()] = False
+        leaders = true_indices(leads)
+        valid, vanishing = _valid(mesh, queue.index_select(0, leaders), min_quality)
+        winners = leaders[valid]
+        removes[winners] = vanishing[valid]
+        _, around = stars(mesh.topology, removed.index_select(0, winners))
+        blocked[mesh.tets.index_select(0, around).view(-1).long()] = True
+        pending = pending[~(blocked.index_select(0, vertices) | leads.index_select(0, pending))]
     taken = true_indices(removes > 0)
     return queue[taken], removes[taken]
 
 
-def _with_candidates(groups: torch.Tensor, rank: torch.Tensor, count: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Rows of `groups` (G, 4) with a vertex of a rank below count, and the lowest rank (G',) of each."""
-    kept, lowest = [groups[:0]], [rank[:0]]
-    for part in chunks(groups.shape[0], groups.device, width=4):
-        first = rank.index_select(0, groups[part].reshape(-1)).view(-1, 4).amin(1)
-        rows = true_indices(first < count)
-        kept.append(groups[part][rows])
-        lowest.append(first[rows])
-    return torch.cat(kept), torch.cat(lowest)
+def _between_candidates(edges: torch.Tensor, rank: torch.Tensor, count: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Rows of `edges` (E, 2) with both ends of a rank below count, and the higher rank (E',) of each."""
+    kept, highest = [edges[:0]], [rank[:0]]
+    for part in chunks(edges.shape[0], edges.device, width=2):
+        ranks = rank.index_select(0, edges[part].reshape(-1)).view(-1, 2)
+        later = torch.maximum(ranks[:, 0], ranks[:, 1])
+        rows = true_indices(later < count)
+        kept.append(edges[part].index_select(0, rows))
+        highest.append(later.index_select(0, rows))
+    return torch.cat(kept), torch.cat(highest)
 
 
 def _valid(mesh: TetMesh, half_edges: torch.Tensor, min_quality: float) -> tuple[torch.Tensor, torch.Tensor]:
     """(N,) bool, which collapses are valid alone, and (N,) how many cells each would remove."""
     count = half_edges.shape[0]
-    owner, cells = stars(mesh.topology, half_edges[:, 0].long())
-    tets = mesh.tets[cells]
-    removed, kept = half_edges.unbind(1)
-    vanishes = (tets == kept[owner, None]).any(1)
+    pairs = half_edges.long()
+    owner, cells = stars(mesh.topology, pairs[:, 0])
+    tets = mesh.tets.index_select(0, cells)
+    removed, kept = (column.index_select(0, owner) for column in half_edges.t().contiguous())
+    vanishes = is_corner(tets.t(), kept)
     stays = true_indices(~vanishes)
-    changed_owner = owner[stays]
-    changed = torch.where(tets[stays] == removed[changed_owner, None], kept[changed_owner, None], tets[stays])
+    remaining, kept = tets.index_select(0, stays), kept.index_select(0, stays)[:, None]
+    changed = torch.where(remaining == removed.index_select(0, stays)[:, None], kept, remaining)
     positions = mesh.vertices.detach().double()
-    worst = _worst(quality.quality(positions, changed), changed_owner, count)
+    worst = _worst(quality.quality(positions, changed), owner.index_select(0, stays), count)
 
     valid = worst >= max(min_quality, quality.FLAT)
     doubtful = (worst > quality.FLAT) & ~valid
-    rows = true_indices(doubtful[owner])
+    rows = true_indices(doubtful.index_select(0, owner))
     worst_before = _worst(quality.quality(positions, tets[rows]), owner[rows], count)
     valid |= doubtful & (worst >= worst_before)
     indices = true_indices(valid)
-    valid[indices] = link_condition(mesh.topology, half_edges[indices].long())
-    return valid, torch.bincount(owner[vanishes], minlength=count)
+    valid[indices] = link_condition(mesh.topology, pairs[indices])
+    return valid, torch.bincount(owner[true_indices(vanishes)], minlength=count)
 
 
 def _worst(values: torch.Tensor, owner: torch.Tensor, count: int) -> torch.Tensor:
@@ -242,11 +283,10 @@ def _apply(mesh: TetMesh, half_edges: torch.Tensor) -> MeshChange:
     kept = true_indices(is_kept)
     renumbered = is_kept.cumsum(0, dtype=torch.int32) - 1
 
-    _, around = stars(mesh.topology, removed)
-    target = moved_to.index_select(0, mesh.tets[around].view(-1)).view(-1, 4)
-    twice = (target.sort(1).values.diff(dim=1) == 0).any(1)
+    owner, around = stars(mesh.topology, removed)
+    vanishes = is_corner(mesh.tets.index_select(0, around).t(), half_edges[:, 1].index_select(0, owner))
     remains = torch.ones(mesh.num_cells, dtype=torch.bool, device=half_edges.device)
-    remains[around[twice]] = False
+    remains[around[vanishes]] = False
     cells = true_indices(remains)
     renumber = renumbered.index_select(0, moved_to)
     tets = renumber.index_select(0, mesh.tets.index_select(0, cells).view(-1)).view(-1, 4)

@@ -6,7 +6,7 @@ import math
 
 import torch
 
-from difftetvr.mesh.arrays import chunks, sort_keys, true_indices
+from difftetvr.mesh.arrays import chunks, kth_smallest, sort_keys, true_indices
 
 _GOLDEN_RATIO = (5.0**0.5 - 1.0) / 2.0
 
@@ -22,18 +22,61 @@ def best_first(priority: torch.Tensor) -> torch.Tensor:
     Returns:
         (N,) int64 indices into `priority`.
     """
-    count = priority.shape[0]
+    return _in_order(priority, torch.arange(priority.shape[0], device=priority.device))
+
+
+class BestFirst:
+    """What `best_first` returns, part by part: who needs the head of it only need not have the rest sorted."""
+
+    def __init__(self, priority: torch.Tensor) -> None:
+        """Nothing is sorted yet.
+
+        Args:
+            priority: (N,) real numbers, none of them NaN.
+        """
+        self._priority = priority
+        self._taken = 0
+        self._least: torch.Tensor | None = None
+
+    def __len__(self) -> int:
+        """How many are left."""
+        return self._priority.shape[0] - self._taken
+
+    def take(self, count: int) -> torch.Tensor:
+        """The next ones, in order.
+
+        Args:
+            count: How many at least; all that are left where there are fewer. All of equal priority come together.
+
+        Returns:
+            (M,) int64 indices into `priority`.
+        """
+        priority, total = self._priority, self._priority.shape[0]
+        wanted = torch.ones_like(priority, dtype=torch.bool) if self._least is None else priority < self._least
+        if count < len(self):
+            self._least = kth_smallest(priority, total - self._taken - count)
+            wanted &= priority >= self._least
+        indices = true_indices(wanted)
+        self._taken += indices.shape[0]
+        return _in_order(priority, indices)
+
+
+def _in_order(priority: torch.Tensor, indices: torch.Tensor) -> torch.Tensor:
+    """Sort indices into `priority`, all different, by what they stand for, from highest to lowest."""
+    count = max(priority.shape[0], 1)
     step = max(int(count * _GOLDEN_RATIO), 1)
-    while math.gcd(step, max(count, 1)) != 1:
+    while math.gcd(step, count) != 1:
         step += 1
-    scattered = (torch.arange(count, device=priority.device) * step) % max(count, 1)
+    # Equal values are in the order 0, step, 2 step, ... modulo count; this is the place that an index has in it.
+    place = (indices * pow(step, -1, count)) % count
     if priority.dtype == torch.float32:
         # Floats compare like their bits do, once those of negative numbers are reversed; adding 0 makes -0 a 0. With
         # its place in the lower half of the key no permutation needs sorting, which is ten times faster on a CPU.
-        bits = (priority[scattered] + 0.0).view(torch.int32)
+        bits = (priority.index_select(0, indices) + 0.0).view(torch.int32)
         descending = torch.where(bits < 0, bits & 0x7FFFFFFF, ~bits).long()
-        keys = sort_keys((descending << 32) | torch.arange(count, device=priority.device))
-        return scattered[keys & 0xFFFFFFFF]
+        keys = sort_keys((descending << 32) | place)
+        return ((keys & 0xFFFFFFFF) * step) % count
+    scattered = (sort_keys(place) * step) % count
     return scattered[torch.sort(priority[scattered], descending=True, stable=True).indices]
 
 

@@ -5,10 +5,14 @@ from __future__ import annotations
 import torch
 
 from difftetvr.mesh.arrays import sort_keys, true_indices
-from difftetvr.mesh.incidence import stars
-from difftetvr.mesh.topology import Topology
+from difftetvr.mesh.incidence import boundary_vertices, find_edges, is_corner, shell, stars
+from difftetvr.mesh.topology import LOCAL_FACES, Topology
 
 _PAIRS_AT_ONCE = 2**16
+_LARGEST_RING = 16
+"""Most vertices around an edge for which the quick test is made; more are rare."""
+_FOLLOWING = [face[(face.index(j) + 1) % 3] if j in face else 0 for face in LOCAL_FACES for j in range(4)]
+"""For local vertices i and j at 4 i + j the k with which i, j, k and the fourth have the cell's orientation."""
 _VERTEX_BITS = 32
 _RANK_BITS = 13
 _PAIRS_OF_THREE = ((0, 1), (0, 2), (1, 2))
@@ -23,26 +27,86 @@ def link_condition(topology: Topology, pairs: torch.Tensor) -> torch.Tensor:
 
     Args:
         topology: The cells.
-        pairs: (N, 2) int64 vertices that share an edge.
+        pairs: (N, 2) int64 vertices that share an edge; the test is quickest where the first is not on the boundary.
 
     Returns:
         (N,) bool. False also for an edge with more than 8192 vertices around it.
     """
-    closed = topology.cached("link.closed", lambda: _closed(topology))
-    parts = [_condition(closed, part) for part in pairs.split(_PAIRS_AT_ONCE)]
-    return torch.cat(parts) if parts else torch.ones(0, dtype=torch.bool, device=pairs.device)
+    holds = torch.zeros(pairs.shape[0], dtype=torch.bool, device=pairs.device)
+    doubtful = boundary_vertices(topology).index_select(0, pairs[:, 0])
+    for part in true_indices(~doubtful).split(_PAIRS_AT_ONCE):
+        holds[part], doubtful[part] = _simple_condition(topology, pairs[part])
+    rest = true_indices(doubtful)
+    # Often there are none, of which split would make a part, too.
+    for part in rest.split(_PAIRS_AT_ONCE) if rest.numel() else ():
+        holds[part] = _condition(topology, pairs[part])
+    return holds
 
 
-def _closed(topology: Topology) -> Topology:
-    faces = topology.boundary_faces
-    outside = torch.full_like(faces[:, :1], topology.num_vertices)
-    return Topology(torch.cat((topology.tets, torch.cat((faces, outside), 1))), topology.num_vertices + 1)
+def _simple_condition(topology: Topology, pairs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """(N,) bool, where the condition surely holds, and (N,) bool, where that takes a closer look.
+
+    The first of each pair, v, must not be on the boundary. Only faces of Lk(v) without u are looked at. A corner that
+    is a neighbour of u is a common vertex, and must be in Lk(uv). If all are, common edges have both ends in Lk(uv).
+    Each edge of Lk(uv) is in one of the faces, as v is inside: if as many faces have two corners in Lk(uv) as it has
+    edges, and none has three, there are no other edges that could be common.
+    """
+    owner, cells = stars(topology, pairs[:, 0])
+    corners = topology.tets.index_select(0, cells).t().contiguous()
+    first, other = (column.int().index_select(0, owner) for column in pairs.unbind(1))
+    is_shared = is_corner(corners, other)
+    shared, apart = true_indices(is_shared), true_indices(~is_shared)
+    sizes = _per_owner(owner.index_select(0, shared), pairs.shape[0])
+    ring = _rings(corners.index_select(1, shared), first[shared], other[shared], owner[shared], sizes)
+
+    corners, first, other, owner = (values.index_select(-1, apart) for values in (corners, first, other, owner))
+    on_ring = torch.zeros_like(corners, dtype=torch.bool)
+    for vertex in ring:
+        on_ring |= corners == vertex.index_select(0, owner)
+    corners_on_ring = on_ring.sum(0, dtype=torch.uint8)
+    doubtful = _per_owner(owner.index_select(0, true_indices(corners_on_ring == 2)), pairs.shape[0]) != sizes
+    doubtful[owner.index_select(0, true_indices(corners_on_ring == 3))] = True
+
+    off = true_indices((~on_ring & (corners != first)).view(-1))
+    ends = torch.stack((corners.view(-1).index_select(0, off), other.repeat(4).index_select(0, off)), 1)
+    neighbours = off[find_edges(topology, ends.long()) >= 0]
+    fails = torch.zeros_like(doubtful)
+    fails[owner.repeat(4).index_select(0, neighbours)] = True
+    is_part = sizes > _LARGEST_RING
+    fails &= ~is_part
+    doubtful |= is_part
+    return ~(fails | doubtful), doubtful & ~fails
 
 
-def _condition(closed: Topology, pairs: torch.Tensor) -> torch.Tensor:
+def _rings(
+    corners: torch.Tensor, first: torch.Tensor, other: torch.Tensor, owner: torch.Tensor, sizes: torch.Tensor
+) -> torch.Tensor:
+    """Vertices around edges (K, N), padded with -1, at most `_LARGEST_RING` of each edge.
+
+    Args:
+        corners: (4, M) of the cells around the edges, one after the other.
+        first: (M,) one end of each cell's edge.
+        other: (M,) the other end.
+        owner: (M,) int64 ascending, the edge.
+        sizes: (N,) how many cells each edge has.
+    """
+    # All cells have one orientation, so each vertex around the edge follows the ends in one of the cells.
+    i, j = ((corners[1] == end) + 2 * (corners[2] == end) + 3 * (corners[3] == end) for end in (first, other))
+    following = torch.tensor(_FOLLOWING, device=owner.device).index_select(0, 4 * i + j)
+    vertices = corners.gather(0, following[None])[0]
+    row = torch.arange(owner.shape[0], device=owner.device) - (sizes.cumsum(0) - sizes).index_select(0, owner)
+    width = min(int(sizes.max()), _LARGEST_RING) if sizes.numel() else 0
+    ring = corners.new_full((width, sizes.shape[0]), -1)
+    fits = true_indices(row < width)
+    ring[row[fits], owner[fits]] = vertices[fits]
+    return ring
+
+
+def _condition(topology: Topology, pairs: torch.Tensor) -> torch.Tensor:
+    """(N,) bool: the condition, by sorting all that is in the links."""
     first, other = pairs.unbind(1)
-    owner, faces = _link_faces(closed, first)
-    other_owner, other_faces = _link_faces(closed, other)
+    owner, faces = _link_faces(topology, first)
+    other_owner, other_faces = _link_faces(topology, other)
     # Cells around the edge: faces of the one link that contain the other vertex; what they have besides is Lk(uv).
     shared = (faces == other[owner, None]).any(1)
     ring = faces[shared][faces[shared] != other[owner[shared], None]].view(-1, 2)
@@ -94,10 +158,11 @@ def _simplices(owner: torch.Tensor, ranks: torch.Tensor, corners: tuple[tuple[in
     return torch.cat(keys)
 
 
-def _link_faces(closed: Topology, vertices: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def _link_faces(topology: Topology, vertices: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Faces opposite vertices in the cells around them: owner (M,), the row of `vertices`, and (M, 3) corners."""
-    owner, cells = stars(closed, vertices)
-    tets = closed.tets[cells].long()
+    parts = [(part.tets, *stars(part, vertices)) for part in (topology, shell(topology))]
+    owner = torch.cat([owner for _, owner, _ in parts])
+    tets = torch.cat([tets.index_select(0, cells) for tets, _, cells in parts]).long()
     return owner, tets[tets != vertices[owner, None]].view(-1, 3)
 
 

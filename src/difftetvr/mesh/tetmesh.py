@@ -18,7 +18,8 @@ class TetMesh:
     """A valid, conforming, positively oriented tetrahedral mesh.
 
     Valid means: all positions finite, no cell flat, at most two cells at a face, neighbours on opposite sides of their
-    common face. Holes, several components and vertices that no cell uses are allowed.
+    common face. Holes, several components and vertices that no cell uses are allowed. Loose cells are the exception:
+    they may overlap, hang and share faces as they like, and whatever asks for their neighbours raises `MeshError`.
 
     Attributes:
         vertices: (V, 3) float32 or float64 positions; may require grad.
@@ -30,7 +31,7 @@ class TetMesh:
     tets: torch.Tensor
     topology: Topology
 
-    def __init__(self, vertices: Any, tets: Any) -> None:
+    def __init__(self, vertices: Any, tets: Any, *, conforming: bool = True) -> None:
         """Build a mesh from arrays, check it, and orient its cells.
 
         Cells of negative volume get their last two vertices swapped; their order and all else stays. A volume counts as
@@ -40,10 +41,12 @@ class TetMesh:
             vertices: (V, 3) positions, array-like. A float32 or float64 tensor is kept as it is, autograd graph
                 included; lists and other dtypes become float32.
             tets: (T, 4) integer vertex indices, array-like; copied.
+            conforming: False for loose cells, whose faces are not matched and not checked.
 
         Raises:
             MeshError: Names the first offending cell: index out of range, vertex not finite, repeated vertex, zero
-                volume, face shared by three cells, overlap with a neighbour. Also for wrong shapes and dtypes.
+                volume, face shared by three cells, overlap with a neighbour (the last two not for loose cells). Also
+                for wrong shapes and dtypes.
         """
         points = validation.as_vertices(vertices)
         cells = validation.as_tets(tets, points.shape[0], points.device)
@@ -51,8 +54,9 @@ class TetMesh:
         signs = validation.orientations(points, cells)
         validation.check_not_flat(points, cells, signs)
         _orient(cells, signs)
-        topology = Topology(cells, points.shape[0])
-        topology.cell_adjacency  # noqa: B018  pairs all faces, and so finds every one that cannot be
+        topology = Topology(cells, points.shape[0], is_conforming=conforming)
+        if conforming:
+            topology.cell_adjacency  # noqa: B018  pairs all faces, and so finds every one that cannot be
         self._assign(points, topology)
 
     @classmethod
@@ -129,6 +133,11 @@ class TetMesh:
         """Number of cells T."""
         return self.tets.shape[0]
 
+    @property
+    def is_conforming(self) -> bool:
+        """Whether cells meet face to face; False for loose cells, which have no neighbours."""
+        return self.topology.is_conforming
+
     def with_vertices(self, vertices: torch.Tensor) -> TetMesh:
         """The same cells at other positions; costs nothing and checks nothing but the shape (see `validate`).
 
@@ -194,7 +203,8 @@ class TetMesh:
         if kept.numel() == self.num_vertices:
             return self, kept
         renumbered = used.cumsum(0, dtype=torch.int32) - 1
-        topology = Topology(renumbered[self.tets], kept.numel(), self.topology.cell_adjacency)
+        adjacency = self.topology.cell_adjacency if self.is_conforming else None
+        topology = Topology(renumbered[self.tets], kept.numel(), adjacency, is_conforming=self.is_conforming)
         return TetMesh.from_valid(self.vertices[kept], topology), kept
 
     def volumes(self) -> torch.Tensor:

@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 
 import torch
 
+from difftetvr.errors import MeshError
 from difftetvr.mesh.arrays import chunks, sort_keys, true_indices
 from difftetvr.mesh.faces import LOCAL_FACES, check_matching, face_vertices, match_faces
 
@@ -35,18 +36,29 @@ class Topology:
     Attributes:
         tets: (T, 4) int32 vertex indices of positively oriented cells.
         num_vertices: Number of vertices V.
+        is_conforming: Whether cells meet face to face. Loose cells need not: they have edges and the cells around a
+            vertex, but nothing that comes from `cell_adjacency`.
     """
 
-    def __init__(self, tets: torch.Tensor, num_vertices: int, cell_adjacency: torch.Tensor | None = None) -> None:
+    def __init__(
+        self,
+        tets: torch.Tensor,
+        num_vertices: int,
+        cell_adjacency: torch.Tensor | None = None,
+        *,
+        is_conforming: bool = True,
+    ) -> None:
         """Wrap the cells; nothing is computed yet.
 
         Args:
             tets: (T, 4) int32 vertex indices, all in [0, num_vertices).
             num_vertices: Number of vertices V, unused ones included.
-            cell_adjacency: (T, 4) int32, where the caller knows it already.
+            cell_adjacency: (T, 4) int32, where the caller knows it already; None for loose cells.
+            is_conforming: False for loose cells.
         """
         self.tets = tets.contiguous()
         self.num_vertices = num_vertices
+        self.is_conforming = is_conforming
         self._tables: dict[str, Any] = {} if cell_adjacency is None else {"cell_adjacency": cell_adjacency}
 
     @property
@@ -59,7 +71,7 @@ class Topology:
         """(T, 4) int32: the cell across the face opposite local vertex k, -1 on the boundary.
 
         Raises:
-            MeshError: More than two cells share a face, or two neighbours overlap.
+            MeshError: The cells are loose, more than two of them share a face, or two neighbours overlap.
         """
         return self.cached("cell_adjacency", self._build_cell_adjacency)
 
@@ -123,9 +135,16 @@ class Topology:
         if tets is self.tets:
             return self
         adjacency = self._tables.get("cell_adjacency")
-        return Topology(tets, self.num_vertices, None if adjacency is None else adjacency.to(device))
+        known = None if adjacency is None else adjacency.to(device)
+        return Topology(tets, self.num_vertices, known, is_conforming=self.is_conforming)
 
     def _build_cell_adjacency(self) -> torch.Tensor:
+        if not self.is_conforming:
+            raise MeshError(
+                "This mesh is made of loose cells (conforming=False), which have no neighbours: only "
+                "renderer='projected' and what looks at cells one by one work with it; build it with conforming=True "
+                "if its cells meet face to face."
+            )
         matching = match_faces(self.tets, self.num_vertices)
         check_matching(matching, self.tets)
         return matching.cell_adjacency
