@@ -19,6 +19,7 @@ from scipy.ndimage import map_coordinates
 from vtk.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray, vtk_to_numpy
 
 from difftetvr.mesh import Field, TetMesh
+from difftetvr.render import ScalarField
 from difftetvr.render.camera import Camera
 
 _PROBE = "import vtk; w = vtk.vtkRenderWindow(); w.SetOffScreenRendering(1); w.SetSize(8, 8); w.Render()"
@@ -46,6 +47,16 @@ def unstructured_grid(mesh: TetMesh, field: Field) -> vtk.vtkUnstructuredGrid:
     rgba = numpy_to_vtk(values, deep=True)
     rgba.SetName("rgba")
     grid.GetPointData().SetScalars(rgba)
+    return grid
+
+
+def scalar_grid(mesh: TetMesh, scalar: torch.Tensor) -> vtk.vtkUnstructuredGrid:
+    """The mesh with a scalar as point data."""
+    nothing = Field(torch.zeros(mesh.num_vertices, 3), torch.zeros(mesh.num_vertices))
+    grid = unstructured_grid(mesh, nothing)
+    values = numpy_to_vtk(scalar.detach().cpu().double().numpy(), deep=True)
+    values.SetName("scalar")
+    grid.GetPointData().SetScalars(values)
     return grid
 
 
@@ -78,6 +89,7 @@ class VtkView:
         volume = vtk.vtkVolume()
         volume.SetProperty(appearance)
         volume.SetMapper(mapper)
+        self._appearance = appearance
         renderer = vtk.vtkRenderer()
         renderer.SetBackground(0.0, 0.0, 0.0)
         renderer.AddVolume(volume)
@@ -100,6 +112,22 @@ class VtkView:
         self._camera.SetViewUp(*(-rotation[1]).tolist())
         self._camera.SetViewAngle(math.degrees(2.0 * math.atan(0.5 * camera.height / camera.fy)))
         self._camera.SetWindowCenter(1.0 - 2.0 * camera.cx / camera.width, 2.0 * camera.cy / camera.height - 1.0)
+
+    def show_scalar(self, field: ScalarField) -> None:
+        """Colour and opacity from the transfer function of a scalar with a range."""
+        assert field.value_range is not None
+        low, high = field.value_range
+        function = field.transfer_function
+        color, opacity = vtk.vtkColorTransferFunction(), vtk.vtkPiecewiseFunction()
+        color.SetColorSpaceToRGB()
+        for knot, alpha, rgb in zip(function.scalar, function.opacity, function.color, strict=True):
+            value = low + float(knot) * (high - low)
+            color.AddRGBPoint(value, *rgb.tolist())
+            opacity.AddPoint(value, float(alpha))
+        self._appearance.IndependentComponentsOn()
+        self._appearance.SetColor(color)
+        self._appearance.SetScalarOpacity(opacity)
+        self._appearance.SetScalarOpacityUnitDistance(1.0 / field.attenuation)
 
     def render(self) -> None:
         """Render the volume anew."""

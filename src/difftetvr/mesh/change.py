@@ -101,7 +101,7 @@ def with_midpoints(mesh: TetMesh, ends: torch.Tensor, tets: torch.Tensor, cell_p
     weight[mesh.num_vertices :] = 0.5
     positions = mesh.vertices.detach()
     midpoints = torch.lerp(positions.index_select(0, ends[:, 0]), positions.index_select(0, ends[:, 1]), 0.5)
-    changed = mesh_of(torch.cat((positions, midpoints)), tets)
+    changed = mesh_of(torch.cat((positions, midpoints)), tets, mesh.is_conforming)
     return MeshChange(changed, parents, weight, cell_parents, mesh.num_vertices, mesh.num_cells)
 
 
@@ -123,12 +123,13 @@ def with_vertices_kept(mesh: TetMesh, kept: torch.Tensor, topology: Topology, ce
     return MeshChange(changed, parents, weight, cell_parents, mesh.num_vertices, mesh.num_cells)
 
 
-def mesh_of(vertices: torch.Tensor, tets: torch.Tensor) -> TetMesh:
+def mesh_of(vertices: torch.Tensor, tets: torch.Tensor, is_conforming: bool = True) -> TetMesh:
     """Wrap cells that are valid by construction.
 
     Args:
         vertices: (V, 3) positions.
         tets: (T, 4) int32.
+        is_conforming: Whether they meet face to face.
 
     Returns:
         The mesh.
@@ -138,7 +139,7 @@ def mesh_of(vertices: torch.Tensor, tets: torch.Tensor) -> TetMesh:
     """
     if tets.shape[0] > MAX_CELLS:
         raise MeshError(f"The refined mesh would have {tets.shape[0]} cells, more than {MAX_CELLS}; refine less of it.")
-    return TetMesh.from_valid(vertices, Topology(tets, vertices.shape[0]))
+    return TetMesh.from_valid(vertices, Topology(tets, vertices.shape[0], is_conforming=is_conforming))
 
 
 def check_indices(indices: torch.Tensor, count: int, what: str) -> torch.Tensor:

@@ -1,0 +1,110 @@
+"""VTK's own files, legacy and XML, as VTK writes them."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from difftetvr.errors import MeshError
+from difftetvr.mesh.io import load_data
+
+pytest.importorskip("meshio")
+
+
+def vtk_grid(with_voxel):
+    """A grid of VTK with all kinds of linear volume cells, a triangle, and data of many types; its tetrahedra's number.
+
+    With a hexahedron in place of the voxel where it shall have none.
+    """
+    vtk = pytest.importorskip("vtk")
+    from vtk.util.numpy_support import numpy_to_vtk
+
+    points = np.array(list(itertools.product(range(2), range(2), range(6)))).astype(float)
+    number = {tuple(p): i for i, p in enumerate(points.astype(int).tolist())}
+    cube = [[number[x, y, z + k] for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))] for k in (0, 1) for z in range(5)]
+    cells = [(vtk.VTK_HEXAHEDRON, cube[0] + cube[5]), (vtk.VTK_TRIANGLE, cube[0][:3])]
+    low, high = cube[1], cube[6]
+    cells += [(vtk.VTK_WEDGE, [low[i] for i in (0, 1, 2)] + [high[i] for i in (0, 1, 2)])]
+    low, high = cube[3], cube[8]
+    voxel = [low[i] for i in (0, 1, 3, 2)] + [high[i] for i in (0, 1, 3, 2)]
+    cells += [(vtk.VTK_VOXEL, voxel) if with_voxel else (vtk.VTK_HEXAHEDRON, low + high)]
+    low, high = cube[4], cube[9]
+    cells += [(vtk.VTK_PYRAMID, [*low, high[0]]), (vtk.VTK_TETRA, [low[1], low[2], high[0], high[2]])]
+    grid = vtk.vtkUnstructuredGrid()
+    coordinates = vtk.vtkPoints()
+    coordinates.SetData(numpy_to_vtk(points, deep=True))
+    grid.SetPoints(coordinates)
+    for kind, nodes in cells:
+        grid.InsertNextCell(kind, len(nodes), nodes)
+    for data, count in ((grid.GetPointData(), len(points)), (grid.GetCellData(), len(cells))):
+        for dtype in ("f4", "f8", "i1", "u1", "i2", "i4", "u4", "i8"):
+            array = numpy_to_vtk(np.arange(count * 2, dtype=dtype).reshape(count, 2), deep=True)
+            array.SetName(f"{dtype} two")
+            data.AddArray(array)
+        scalars = numpy_to_vtk(np.arange(count, dtype=float), deep=True)
+        scalars.SetName("s")
+        data.SetScalars(scalars)
+    return vtk, grid, 6 + 3 + 6 + 2 + 1
+
+
+@pytest.mark.parametrize("binary", [False, True])
+@pytest.mark.parametrize("version", [42, 51])
+def test_legacy_files_that_vtk_writes(tmp_path, version, binary):
+    vtk, grid, tets = vtk_grid(with_voxel=True)
+    writer = vtk.vtkUnstructuredGridWriter()
+    writer.SetFileName(str(tmp_path / "a.vtk"))
+    writer.SetInputData(grid)
+    writer.SetFileVersion(version)
+    (writer.SetFileTypeToBinary if binary else writer.SetFileTypeToASCII)()
+    writer.Write()
+    check_vtk_grid(load_data(tmp_path / "a.vtk", split=True), tets)
+
+
+@pytest.mark.parametrize("mode", ["Ascii", "Binary", "Appended"])
+@pytest.mark.parametrize("compressor", ["None", "ZLib", "LZMA"])
+def test_xml_files_that_vtk_writes(tmp_path, mode, compressor):
+    for with_voxel in (False, True):
+        vtk, grid, tets = vtk_grid(with_voxel)
+        writer = vtk.vtkXMLUnstructuredGridWriter()
+        writer.SetFileName(str(tmp_path / "a.vtu"))
+        writer.SetInputData(grid)
+        getattr(writer, f"SetDataModeTo{mode}")()
+        getattr(writer, f"SetCompressorTypeTo{compressor}")()
+        writer.Write()
+        if with_voxel:
+            with pytest.raises(MeshError, match="type 11"):  # which meshio leaves out
+                load_data(tmp_path / "a.vtu", split=True)
+        else:
+            check_vtk_grid(load_data(tmp_path / "a.vtu", split=True), tets)
+
+
+def check_vtk_grid(data, tets):
+    assert data.mesh.num_cells == tets
+    assert float(data.mesh.volumes().sum()) == pytest.approx(1 + 0.5 + 1 + 1 / 3 + 1 / 6)
+    of_cells = data.cell_data["s"].tolist()
+    assert [of_cells.count(i) for i in range(6)] == [6, 0, 3, 6, 2, 1]
+    for dtype in ("f4", "f8", "i1", "u1", "i2", "i4", "u4", "i8"):
+        values = data.cell_data[f"{dtype} two"]
+        assert values.is_floating_point() == (dtype[0] == "f")
+        assert values[:, 0].tolist() == [2 * i for i in of_cells]
+    assert data.point_data["s"].tolist() == [i for i in range(24) if data.point_data["u1 two"][:, 0].eq(2 * i).any()]
+
+
+def test_structured_legacy_files(tmp_path):
+    path = tmp_path / "a.vtk"
+    head = "# vtk DataFile Version 3.0\ngrid\nASCII\nDATASET {}\nDIMENSIONS 3 2 2\n"
+    tail = "POINT_DATA 12\nSCALARS s float\nLOOKUP_TABLE default\n" + " ".join(map(str, range(12)))
+    points = " ".join(f"{x} {2 * y} {3 * z}" for z in range(2) for y in range(2) for x in range(3))
+    for kind, body in (
+        ("STRUCTURED_POINTS", "ORIGIN 0 0 0\nSPACING 1 2 3\n"),
+        ("RECTILINEAR_GRID", "X_COORDINATES 3 float\n0 1 2\nY_COORDINATES 2 int\n0 2\nZ_COORDINATES 2 float\n0 3\n"),
+        ("STRUCTURED_GRID", f"POINTS 12 float\n{points}\n"),
+    ):
+        path.write_text(head.format(kind) + body + tail)
+        data = load_data(path, split=True)
+        assert data.mesh.num_cells == 12
+        assert float(data.mesh.volumes().sum()) == pytest.approx(12)
+        assert data.point_data["s"].tolist() == list(range(12))
+    path.write_text(head.format("STRUCTURED_POINTS").replace("3 2 2", "100 100 100") + tail)
+    with pytest.raises(MeshError, match="announces 100 x 100 x 100 points"):
+        load_data(path, split=True)
