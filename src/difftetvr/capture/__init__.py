@@ -1,4 +1,4 @@
-"""Where images come from: volumes with transfer functions, saved captures, camera orbits."""
+"""Where images come from: volumes with transfer functions, photographs, saved captures, camera orbits."""
 
 from __future__ import annotations
 
@@ -8,6 +8,9 @@ from typing import Any
 
 from difftetvr.capture.capture import Capture
 from difftetvr.capture.orbit import fibonacci_orbit, random_orbit
+from difftetvr.capture.packed import PackedImages
+from difftetvr.capture.photo_set import CaptureWarning
+from difftetvr.capture.photos import PhotoCapture, is_photo_source
 from difftetvr.capture.volume import Volume, is_volume_file
 from difftetvr.capture.volume_capture import TOOTH, VolumeCapture
 from difftetvr.capture.volume_renderer import VolumeRenderer
@@ -16,6 +19,9 @@ from difftetvr.optics.transfer_function import TransferFunction
 
 __all__ = [
     "Capture",
+    "CaptureWarning",
+    "PackedImages",
+    "PhotoCapture",
     "TransferFunction",
     "Volume",
     "VolumeCapture",
@@ -30,26 +36,38 @@ def load_capture(source: str | Path, **overrides: Any) -> Capture:
     """Images and cameras from whatever ``source`` is.
 
     Args:
-        source: ``tooth`` for the packaged scan, a volume file (``.raw``, ``.dat``, ``.nrrd``, ``.nhdr``, ``.vti``),
-            or a capture saved as ``.npz``.
+        source: ``tooth`` for the packaged scan, a volume file (``.raw``, ``.dat``, ``.nrrd``, ``.nhdr``, ``.vti``), a
+            capture saved as ``.npz``, or photographs with known cameras: a folder (NeRF-synthetic, nerfstudio,
+            instant-ngp, COLMAP, or with a cameras.json of our own), such a ``.json`` file, or a tiny NeRF ``.npz``.
         **overrides: Fields of :class:`VolumeCapture` for the tooth and for volumes; a volume needs at least
-            ``transfer_function``. None stands for the field's default.
+            ``transfer_function``. Fields of :class:`PhotoCapture` for photographs. None stands for the field's default.
 
     Raises:
         CaptureError: The source or an override is not known or not valid.
     """
     chosen = {key: value for key, value in overrides.items() if value is not None}
-    known = {field.name for field in fields(VolumeCapture)} - {"path"}
+    kind = _kind(source, chosen)
+    if kind is None:
+        if chosen:
+            raise CaptureError(f"The saved capture '{source}' is read as it is; leave out '{sorted(chosen)[0]}'.")
+        return Capture.load(source)
+    known = {field.name for field in fields(kind)} - {"path"}
     unknown = sorted(set(chosen) - known)
     if unknown:
-        raise CaptureError(f"A capture has no setting '{unknown[0]}'; known are {', '.join(sorted(known))}.")
+        what = "A capture of photos" if kind is PhotoCapture else "A capture of a volume"
+        raise CaptureError(f"{what} has no setting '{unknown[0]}'; known are {', '.join(sorted(known))}.")
+    return kind(path=str(source), **chosen).build()
+
+
+def _kind(source: str | Path, chosen: dict[str, Any]) -> type[VolumeCapture | PhotoCapture] | None:
+    """What describes a source; None for a saved capture, which describes itself."""
     if str(source) == TOOTH or is_volume_file(source):
-        return VolumeCapture(path=str(source), **chosen).build()
-    if Path(source).suffix.lower() != ".npz":
-        raise CaptureError(
-            f"'{source}' is no capture: give 'tooth', a volume (.raw, .dat, .nrrd, .nhdr, .vti) or a saved capture "
-            "(.npz)."
-        )
-    if chosen:
-        raise CaptureError(f"The saved capture '{source}' is read as it is; leave out '{sorted(chosen)[0]}'.")
-    return Capture.load(source)
+        return VolumeCapture
+    if "format" in chosen or is_photo_source(source):
+        return PhotoCapture
+    if Path(source).suffix.lower() == ".npz":
+        return None
+    raise CaptureError(
+        f"'{source}' is no capture: give 'tooth', a volume (.raw, .dat, .nrrd, .nhdr, .vti), a saved capture (.npz), "
+        "or a folder of photos with their cameras."
+    )

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import math
-import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Literal, get_args
 
-import numpy as np
 import torch
 
-from difftetvr.errors import CameraError, CaptureError
-from difftetvr.files import atomic_write
+from difftetvr.capture.capture_file import read_capture, write_capture
+from difftetvr.capture.packed import PackedImages
+from difftetvr.errors import CaptureError
 from difftetvr.render.camera import Camera
 
-_FILE_VERSION = 1
+Encoding = Literal["linear", "srgb"]
+
 # The attenuation of the published volume experiments, for a box whose longest side is 1.
 _DEFAULT_ATTENUATION = 25.0
 
@@ -25,29 +24,46 @@ _DEFAULT_ATTENUATION = 25.0
 class Capture:
     """Images of an object with known cameras.
 
+    Radiance is whatever the images hold, and rendering blends it as it is. Captures of volumes hold linear light.
+    Photographs, and the NeRF-synthetic images, keep the sRGB-encoded values of their files: alpha composites in that
+    space there, and published PSNR and SSIM are measured in it. ``encoding`` says which, so that results are neither
+    encoded twice nor compared across spaces.
+
     Attributes:
         cameras: N cameras, all of the images' size.
-        images: (N, H, W, 3) float32 linear RGB, premultiplied over black, on the CPU.
-        alphas: (N, H, W) float32 in [0, 1], or None where they are unknown; the background is black then.
+        images: (N, H, W, 3) float32 RGB, premultiplied over black, on the CPU. Photographs are kept as bytes, and
+            unpacked to the same view by view when they are taken by index.
+        alphas: (N, H, W) in [0, 1], kept as the images are, or None where they are unknown; the background is black
+            then.
         test: (N,) bool, views that training never sees. At least one view must be left for training.
         bounds: (2, 3) float32 lower and upper corner of the box that holds the object, in world space.
         name: What to call the capture.
         density_unit: Typical density per world unit, a scale for optimisers; 0 stands for 25 / longest side of the box.
+        encoding: Whether the images hold linear light (``linear``) or sRGB-encoded values (``srgb``).
+        valid: (N, H, W) bool, false for pixels that masks of the capture exclude and that no loss should count; None
+            where all are valid.
+        points: (P, 3) float32 points on the scene's surfaces, in world space, or None where none are known.
+        point_colors: (P, 3) float32 colours of the points in [0, 1], encoded as the images are, or None.
 
     Raises:
         CaptureError: Shapes do not match or a value is not valid; names the first offending view.
     """
 
     cameras: list[Camera]
-    images: torch.Tensor
-    alphas: torch.Tensor | None
+    images: torch.Tensor | PackedImages
+    alphas: torch.Tensor | PackedImages | None
     test: torch.Tensor
     bounds: torch.Tensor
     name: str
     density_unit: float = 0.0
+    encoding: Encoding = "linear"
+    valid: torch.Tensor | None = None
+    points: torch.Tensor | None = None
+    point_colors: torch.Tensor | None = None
 
     def __post_init__(self) -> None:
         self._check_images()
+        self._check_optional()
         self._check_cameras()
         if self.test.shape != (len(self.cameras),) or self.test.dtype != torch.bool:
             raise CaptureError(
@@ -73,14 +89,34 @@ class Capture:
             raise CaptureError(
                 f"The images of '{self.name}' have shape {shape}; they need (N, H, W, 3), none of them 0."
             )
-        self.images = self.images.to("cpu", torch.float32)
-        self._check_views(~torch.isfinite(self.images) | (self.images < 0), "a colour that is negative or not finite")
+        if not isinstance(self.images, PackedImages):
+            self.images = self.images.to("cpu", torch.float32)
+            self._check_views(
+                ~torch.isfinite(self.images) | (self.images < 0), "a colour that is negative or not finite"
+            )
         if self.alphas is None:
             return
         if self.alphas.shape != shape[:3]:
             raise CaptureError(f"The alphas of '{self.name}' have shape {tuple(self.alphas.shape)}, not {shape[:3]}.")
-        self.alphas = self.alphas.to("cpu", torch.float32)
-        self._check_views(~((self.alphas >= 0) & (self.alphas <= 1)), "an alpha outside [0, 1]")
+        if not isinstance(self.alphas, PackedImages):
+            self.alphas = self.alphas.to("cpu", torch.float32)
+            self._check_views(~((self.alphas >= 0) & (self.alphas <= 1)), "an alpha outside [0, 1]")
+
+    def _check_optional(self) -> None:
+        if self.encoding not in get_args(Encoding):
+            raise CaptureError(f"The encoding of '{self.name}' is '{self.encoding}'; it must be linear or srgb.")
+        shape = self.images.shape[:3]
+        if self.valid is not None and (self.valid.shape != shape or self.valid.dtype != torch.bool):
+            raise CaptureError(f"The valid pixels of '{self.name}' must be {tuple(shape)} bools, one for each pixel.")
+        for name in ("points", "point_colors"):
+            values = getattr(self, name)
+            if values is None:
+                continue
+            if values.ndim != 2 or values.shape[1] != 3 or not bool(torch.isfinite(values).all()):
+                raise CaptureError(f"The {name} of '{self.name}' must be (P, 3) finite numbers.")
+            setattr(self, name, values.to("cpu", torch.float32))
+        if self.point_colors is not None and (self.points is None or len(self.points) != len(self.point_colors)):
+            raise CaptureError(f"'{self.name}' needs a point for each of its point_colors; give as many of both.")
 
     def _check_views(self, wrong: torch.Tensor, what: str) -> None:
         views = wrong.flatten(1).any(dim=1)
@@ -114,71 +150,13 @@ class Capture:
         Raises:
             CaptureError: The name does not end in ``.npz``, or the file cannot be written.
         """
-        if Path(path).suffix.lower() != ".npz":
-            raise CaptureError(f"A capture is saved as .npz; '{path}' ends otherwise.")
-        content: dict[str, Any] = {
-            "version": np.array(_FILE_VERSION),
-            "images": self.images.numpy(),
-            "test": self.test.numpy(),
-            "bounds": self.bounds.numpy(),
-            "name": np.array(self.name),
-            "density_unit": np.array(self.density_unit),
-            "world_to_camera": torch.stack([c.world_to_camera.detach().cpu() for c in self.cameras]).numpy(),
-            "intrinsics": np.array([(c.fx, c.fy, c.cx, c.cy) for c in self.cameras]),
-        }
-        if self.alphas is not None:
-            content["alphas"] = self.alphas.numpy()
-        with atomic_write(path, CaptureError) as temporary, temporary.open("wb") as file:
-            np.savez_compressed(file, **content)
+        write_capture(self, path)
 
     @staticmethod
     def load(path: str | Path) -> Capture:
-        """Read what :meth:`save` wrote.
+        """Read what :meth:`save` wrote, in this version or an earlier one.
 
         Raises:
             CaptureError: The file is missing, damaged, or no capture.
         """
-        content = _read_arrays(path)
-        needed = ("version", "images", "test", "bounds", "name", "density_unit", "world_to_camera", "intrinsics")
-        missing = [key for key in needed if key not in content]
-        if missing:
-            raise CaptureError(f"'{path}' is no saved capture: it has no array '{missing[0]}'.")
-        try:
-            if int(content["version"]) != _FILE_VERSION:
-                raise CaptureError(f"'{path}' has the version {content['version']}; update difftetvr to read it.")
-            tensors = {key: torch.from_numpy(content[key]) for key in ("images", "test", "bounds", "world_to_camera")}
-            height, width = (int(n) for n in content["images"].shape[1:3])
-            cameras = [
-                Camera(pose, float(fx), float(fy), float(cx), float(cy), width, height)
-                for pose, (fx, fy, cx, cy) in zip(tensors["world_to_camera"], content["intrinsics"], strict=True)
-            ]
-            alphas = torch.from_numpy(content["alphas"]) if "alphas" in content else None
-            unit = float(content["density_unit"])
-        except CameraError as error:
-            raise CaptureError(f"A camera in '{path}' is not valid: {error}") from None
-        except (TypeError, ValueError):
-            raise CaptureError(f"An array in '{path}' has the wrong shape or type; get the file anew.") from None
-        return Capture(
-            cameras, tensors["images"], alphas, tensors["test"], tensors["bounds"], str(content["name"]), unit
-        )
-
-
-def _read_arrays(path: str | Path) -> dict[str, np.ndarray]:
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            if not isinstance(archive, np.lib.npyio.NpzFile):
-                raise ValueError
-            return {key: archive[key] for key in archive.files}
-    except OSError as error:
-        raise CaptureError(f"Cannot read the capture '{path}': {error.strerror or error}.") from None
-    except (
-        ValueError,
-        EOFError,
-        KeyError,
-        TypeError,
-        SyntaxError,
-        NotImplementedError,
-        zipfile.BadZipFile,
-        zlib.error,
-    ):
-        raise CaptureError(f"'{path}' is damaged or no capture saved by difftetvr; get the file anew.") from None
+        return Capture(**read_capture(path))

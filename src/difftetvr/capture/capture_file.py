@@ -1,0 +1,130 @@
+"""Captures in files: one .npz archive."""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from difftetvr.capture.packed import PackedImages
+from difftetvr.errors import CameraError, CaptureError
+from difftetvr.files import atomic_write
+from difftetvr.render.camera import Camera
+
+if TYPE_CHECKING:
+    from difftetvr.capture.capture import Capture
+
+# Version 1 knew no encoding (all was linear), no bytes, no points and no masks.
+_VERSION = 2
+_NEEDED = ("version", "images", "test", "bounds", "name", "density_unit", "world_to_camera", "intrinsics")
+_OPTIONAL = ("alphas", "valid", "points", "point_colors")
+_DAMAGE = (
+    ValueError,
+    EOFError,
+    KeyError,
+    TypeError,
+    SyntaxError,
+    NotImplementedError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+
+
+def write_capture(capture: Capture, path: str | Path) -> None:
+    """Write a capture to one ``.npz`` file, which :func:`read_capture` reads back to the bit.
+
+    Raises:
+        CaptureError: The name does not end in ``.npz``, or the file cannot be written.
+    """
+    if Path(path).suffix.lower() != ".npz":
+        raise CaptureError(f"A capture is saved as .npz; '{path}' ends otherwise.")
+    cameras = capture.cameras
+    content: dict[str, Any] = {
+        "version": np.array(_VERSION),
+        "images": _array(capture.images),
+        "test": capture.test.numpy(),
+        "bounds": capture.bounds.numpy(),
+        "name": np.array(capture.name),
+        "density_unit": np.array(capture.density_unit),
+        "world_to_camera": torch.stack([c.world_to_camera.detach().cpu() for c in cameras]).numpy(),
+        "intrinsics": np.array([(c.fx, c.fy, c.cx, c.cy) for c in cameras]),
+        "encoding": np.array(capture.encoding),
+    }
+    for key in _OPTIONAL:
+        value = getattr(capture, key)
+        if value is not None:
+            content[key] = _array(value)
+    with atomic_write(path, CaptureError) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, **content)
+
+
+def read_capture(path: str | Path) -> dict[str, Any]:
+    """The fields of a saved capture, of any version so far.
+
+    Raises:
+        CaptureError: The file is missing, damaged, or no capture.
+    """
+    content = read_arrays(path)
+    missing = [key for key in _NEEDED if key not in content]
+    if missing:
+        raise CaptureError(f"'{path}' is no saved capture: it has no array '{missing[0]}'.")
+    try:
+        if not 1 <= int(content["version"]) <= _VERSION:
+            raise CaptureError(f"'{path}' has the version {content['version']}; update difftetvr to read it.")
+        tensors = {key: torch.from_numpy(content[key]) for key in ("images", "test", "bounds", "world_to_camera")}
+        tensors |= {key: torch.from_numpy(content[key]) for key in _OPTIONAL if key in content}
+        height, width = (int(n) for n in content["images"].shape[1:3])
+        cameras = [
+            Camera(pose, float(fx), float(fy), float(cx), float(cy), width, height)
+            for pose, (fx, fy, cx, cy) in zip(tensors.pop("world_to_camera"), content["intrinsics"], strict=True)
+        ]
+        return {
+            "cameras": cameras,
+            "alphas": None,
+            "name": str(content["name"]),
+            "density_unit": float(content["density_unit"]),
+            "encoding": str(content.get("encoding", "linear")),
+            **{key: _packed_if_bytes(key, tensor) for key, tensor in tensors.items()},
+        }
+    except CameraError as error:
+        raise CaptureError(f"A camera in '{path}' is not valid: {error}") from None
+    except (TypeError, ValueError):
+        raise CaptureError(f"An array in '{path}' has the wrong shape or type; get the file anew.") from None
+
+
+def read_arrays(path: str | Path) -> dict[str, np.ndarray]:
+    """All arrays of an .npz archive.
+
+    Raises:
+        CaptureError: The file is missing, damaged, or no archive.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            if not isinstance(archive, np.lib.npyio.NpzFile):
+                raise ValueError
+            return {key: archive[key] for key in archive.files}
+    except OSError as error:
+        raise CaptureError(f"Cannot read the capture '{path}': {error.strerror or error}.") from None
+    except _DAMAGE:
+        raise CaptureError(f"'{path}' is damaged or no capture saved by difftetvr; get the file anew.") from None
+
+
+def array_names(path: str | Path) -> set[str]:
+    """Names of the arrays in an .npz archive; none for what cannot be read."""
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return set(archive.files) if isinstance(archive, np.lib.npyio.NpzFile) else set()
+    except (OSError, *_DAMAGE):
+        return set()
+
+
+def _array(values: torch.Tensor | PackedImages) -> np.ndarray:
+    return (values.data if isinstance(values, PackedImages) else values).numpy()
+
+
+def _packed_if_bytes(key: str, tensor: torch.Tensor) -> torch.Tensor | PackedImages:
+    return PackedImages(tensor) if key in ("images", "alphas") and tensor.dtype == torch.uint8 else tensor
