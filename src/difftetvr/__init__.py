@@ -8,7 +8,7 @@ from difftetvr.capture import Capture, TransferFunction, Volume, VolumeCapture, 
 from difftetvr.errors import BackendError, CameraError, CaptureError, DiffTetError, MeshError
 from difftetvr.fit import FitConfig, FitError, FitResult, fit
 from difftetvr.mesh import Field, TetMesh
-from difftetvr.mesh.io import load, load_mesh, save
+from difftetvr.mesh.io import MeshData, load, load_data, load_mesh, save
 from difftetvr.render import Camera, RenderedImage, ScalarField, render
 
 __all__ = [
@@ -22,6 +22,7 @@ __all__ = [
     "FitConfig",
     "FitError",
     "FitResult",
+    "MeshData",
     "MeshError",
     "RenderedImage",
     "ScalarField",
@@ -32,6 +33,7 @@ __all__ = [
     "fit",
     "load",
     "load_capture",
+    "load_data",
     "load_mesh",
     "render",
     "save",

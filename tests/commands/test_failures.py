@@ -48,7 +48,7 @@ MEMORY_ERRORS = [
 
 @pytest.mark.parametrize("error", MEMORY_ERRORS, ids=lambda e: f"{type(e).__name__} {e}"[:40])
 def test_every_shortage_of_memory_is_the_same_sentence(run, capsys, monkeypatch, error):
-    monkeypatch.setattr("difftetvr.mesh.io.load_with_optional_field", raising(error))
+    monkeypatch.setattr("difftetvr.mesh.io.load_data", raising(error))
     assert "not enough memory; use fewer cells" in fails(capsys, "info", run / "model.vtu")
 
 
@@ -60,7 +60,7 @@ def test_real_shortages_of_memory_are_recognised():
 
 
 def test_mistakes_of_the_program_are_not_hidden(run, monkeypatch):
-    monkeypatch.setattr("difftetvr.mesh.io.load_with_optional_field", raising(RuntimeError("a shape is wrong")))
+    monkeypatch.setattr("difftetvr.mesh.io.load_data", raising(RuntimeError("a shape is wrong")))
     with pytest.raises(RuntimeError, match="a shape is wrong"):
         cli.main(["info", str(run / "model.vtu")])
 

@@ -1,4 +1,4 @@
-"""The command line: ``difftetvr fit | render | compare | cut | eval | info | export``."""
+"""The command line: ``difftetvr fit | mesh | render | compare | cut | eval | info | export``."""
 
 from __future__ import annotations
 
@@ -10,17 +10,20 @@ from tyro.conf import subcommand
 
 from difftetvr.cli.files import Eval, Export, Info
 from difftetvr.cli.fit import Fit
+from difftetvr.cli.mesh import Mesh
 from difftetvr.cli.options import CaptureOptions, parse
-from difftetvr.cli.pictures import Compare, Cut, Render
+from difftetvr.cli.pictures import Compare, Cut
+from difftetvr.cli.render import Render
 from difftetvr.terminal import console, sentence_for
 
-__all__ = ["CaptureOptions", "Compare", "Cut", "Eval", "Export", "Fit", "Info", "Render", "main"]
+__all__ = ["CaptureOptions", "Compare", "Cut", "Eval", "Export", "Fit", "Info", "Mesh", "Render", "main"]
 
 _USAGE_ERROR = 2
 _INTERRUPTED = 130
 
 Command = (
     Annotated[Fit, subcommand("fit")]
+    | Annotated[Mesh, subcommand("mesh")]
     | Annotated[Render, subcommand("render")]
     | Annotated[Compare, subcommand("compare")]
     | Annotated[Cut, subcommand("cut")]

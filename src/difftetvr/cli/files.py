@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from difftetvr.cli.options import CaptureOptions, load_model
+from difftetvr.cli.options import CaptureOptions, MeshOptions, load_model
 from difftetvr.errors import MeshError
 from difftetvr.files import require_writable
 from difftetvr.fit.errors import FitError
@@ -59,47 +59,64 @@ class Info:
     """Describe a mesh or a capture."""
 
     file: Annotated[str, Positional, arg(metavar="FILE")]
-    """A mesh (.vtu, .vtk, .msh, .mesh, .xdmf, .npz), a volume, a saved capture (.npz), or tooth."""
+    """A mesh (.vtu, .vtk, .msh, .mesh, .xdmf, .npz, .bintet, .ovm, .node), a volume, a capture (.npz), or tooth."""
+    reading: OmitArgPrefixes[MeshOptions] = field(default_factory=MeshOptions)
     views_of: OmitArgPrefixes[CaptureOptions] = field(default_factory=CaptureOptions)
 
     def run(self, console: Console) -> None:
         """Prints tables."""
-        from difftetvr.view.describe import capture_table, mesh_tables
+        from difftetvr.view.describe import capture_table, data_table, mesh_tables
 
         path = Path(self.file)
         if _is_capture(path):
             console.print(capture_table(self.file, self.views_of.load(self.file, console)))
             return
-        from difftetvr.mesh.io import load_with_optional_field
+        from difftetvr.mesh.io import FIELD_ARRAYS
 
-        for table in mesh_tables(self.file, *load_with_optional_field(path)):
+        data = self.reading.load(path, console)
+        for table in mesh_tables(self.file, data.mesh, data.field, data.flat_cells):
             console.print(table)
+        shown = FIELD_ARRAYS if data.field is not None else ()
+        others = [{n: v for n, v in d.items() if n not in shown} for d in (data.point_data, data.cell_data)]
+        if (table_of_data := data_table(*others)) is not None:
+            console.print(table_of_data)
 
 
 @dataclass(frozen=True)
 class Export:
-    """Write a reconstructed volume in another format."""
+    """Write a mesh, with color and density if it has them, in another format."""
 
     model: Annotated[Path, Positional, arg(metavar="MODEL")]
-    """Mesh with color and density."""
+    """Mesh, in any format that is read."""
     output: Annotated[Path, Positional, arg(metavar="OUT")]
-    """File to write: .vtu, .vtk, .msh or .npz."""
+    """File to write: .vtu, .vtk, .msh, .xdmf, .npz, .bintet, .ovm or .node with its .ele; .mesh with --geometry."""
+    geometry: bool = False
+    """Leave out color and density."""
+    reading: OmitArgPrefixes[MeshOptions] = field(default_factory=MeshOptions)
 
     def run(self, console: Console) -> None:
         """Reads and writes."""
-        from difftetvr.mesh.io import load, require_writable_format, save
+        from difftetvr.mesh.io import FIELD_ARRAYS, require_writable_format, save
 
-        require_writable_format(self.output)
+        require_writable_format(self.output, with_field=False)
         require_writable(self.output, MeshError)
-        mesh, field_on_mesh = load(self.model)
-        save(self.output, mesh, field_on_mesh)
-        console.print(f"Wrote {self.output} ({mesh.num_cells:,} cells)")
+        data = self.reading.load(self.model, console)
+        field_on_mesh = None if self.geometry else data.field
+        if field_on_mesh is not None:
+            require_writable_format(self.output)
+        save(self.output, data.mesh, field_on_mesh)
+        written = () if field_on_mesh is None else FIELD_ARRAYS
+        left_out = sorted({*data.point_data, *data.cell_data}.difference(written))
+        content = " and ".join(written) or "geometry only"
+        without = f", without {', '.join(left_out)}" if left_out else ""
+        console.print(f"Wrote {self.output} ({data.mesh.num_cells:,} cells, {content}{without})")
 
 
 def _is_capture(path: Path) -> bool:
+    from difftetvr.capture.photos import is_photo_source
     from difftetvr.capture.volume import is_volume_file
     from difftetvr.capture.volume_capture import TOOTH
     from difftetvr.mesh.io import is_mesh_archive
 
     is_saved_capture = path.suffix.lower() == ".npz" and path.is_file() and not is_mesh_archive(path)
-    return str(path) == TOOTH or is_volume_file(path) or is_saved_capture
+    return is_photo_source(path) or str(path) == TOOTH or is_volume_file(path) or is_saved_capture

@@ -48,8 +48,11 @@ class Fit:
         folder.require_free(resume=self.resume, overwrite=self.overwrite)
         capture = self.views_of.load(self.capture, console)
         trainer = prepare(capture, self.config, resume_from=folder.checkpoint if self.resume else None)
+        if self.config.initial_mesh is not None:
+            _print_start(console, self.config.initial_mesh, trainer)
         # Only now: what cannot even start neither leaves a folder behind nor costs the run that is to be replaced.
-        with folder.occupied(self.to_json(), overwrite=self.overwrite, begun=lambda: trainer.iteration > 0):
+        options = self.to_json() | ({"repair": trainer.repair} if trainer.repair else {})
+        with folder.occupied(options, overwrite=self.overwrite, begun=lambda: trainer.iteration > 0):
             result = self._optimise(trainer, folder, console)
         write_report(folder, result, capture)
         _print_summary(console, result.metrics, folder)
@@ -90,6 +93,14 @@ class Fit:
         if saved["views_of"] != self.views_of:
             raise FitError(f"The run in {self.output} has other views; resume with the same options for them.")
         saved["config"].require_same_run(self.config)
+
+
+def _print_start(console: Console, path: str, trainer: Trainer) -> None:
+    if trainer.repair:
+        console.print(f"Repaired {path}: {trainer.repair}")
+    if not trainer.iteration:
+        values = "its own colours and densities" if trainer.starts_from_field else "uniform colour and density"
+        console.print(f"Beginning with {path}: {trainer.mesh.num_cells:,} cells, {values}")
 
 
 def _print_summary(console: Console, metrics: dict[str, Any], folder: RunFolder) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 
     from difftetvr.capture.capture import Capture
     from difftetvr.mesh.field import Field
+    from difftetvr.mesh.io import MeshData
     from difftetvr.mesh.tetmesh import TetMesh
 
 Output = Annotated[Path, arg(aliases=["-o"])]
@@ -25,7 +27,14 @@ Output = Annotated[Path, arg(aliases=["-o"])]
 
 @dataclass(frozen=True)
 class CaptureOptions:
-    """Views of a volume, for tooth and volume files; what is not given is as in the Tooth benchmark."""
+    """How images are read, or a volume is seen; what is not given is found by looking, or as in the Tooth benchmark."""
+
+    format: Literal["nerf-synthetic", "transforms", "colmap", "cameras", "tiny-nerf"] | None = None
+    """What a folder of photos is; default: found by looking."""
+    downscale: int | None = None
+    """Pixels of a photo along x and y that are averaged to one."""
+    bounds: tuple[float, float, float, float, float, float] | None = None
+    """Box to reconstruct from photos, its lower and its upper corner; default: found."""
 
     transfer_function: str | None = None
     """Transfer function of a volume, .json or .xml."""
@@ -52,20 +61,58 @@ class CaptureOptions:
 
     def load(self, name: str, console: Console) -> Capture:
         """Reads or renders the capture of that name."""
-        from difftetvr.capture import load_capture
+        from difftetvr.capture import CaptureWarning, load_capture
 
-        with waiting(console, f"Preparing the views of {name}"):
-            return load_capture(name, **dataclasses.asdict(self))
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", CaptureWarning)
+            with waiting(console, f"Preparing the views of {name}"):
+                capture = load_capture(name, **dataclasses.asdict(self))
+        for warning in caught:
+            console.print(str(warning.message), highlight=False)
+        return capture
 
 
-def load_model(path: Path, device: str | None) -> tuple[TetMesh, Field]:
-    """A mesh with its field, on the device of that name or the best one."""
+@dataclass(frozen=True)
+class MeshOptions:
+    """How a mesh file is read."""
+
+    split: bool = False
+    """Split hexahedra, wedges and pyramids into tetrahedra, straighten quadratic cells."""
+
+    def load(self, path: Path, console: Console | None = None, *, require_field: bool = False) -> MeshData:
+        """Reads a mesh with its data, less its flat cells, which show nothing.
+
+        Args:
+            path: The mesh file.
+            console: Where to say what was left out.
+            require_field: Insist on color and density.
+        """
+        from difftetvr.mesh.io import load_data
+
+        data = load_data(path, split=self.split, flat="drop", require_field=require_field)
+        if console is not None:
+            for warning in data.warnings:
+                console.print(warning)
+        return data
+
+
+def load_model(
+    path: Path, device: str | None, options: MeshOptions | None = None, console: Console | None = None
+) -> tuple[TetMesh, Field]:
+    """A mesh with its field, on the device of that name or the best one.
+
+    Args:
+        path: The mesh file.
+        device: Name of the device; None: the best one.
+        options: How to read the file.
+        console: Where to say what was left out of it.
+    """
     from difftetvr.fit.trainer import resolve_device
-    from difftetvr.mesh.io import load
 
-    mesh, field_on_mesh = load(path)
+    data = (options or MeshOptions()).load(path, console, require_field=True)
+    assert data.field is not None
     target = resolve_device(device)
-    return mesh.to(device=target), field_on_mesh.to(device=target)
+    return data.mesh.to(device=target), data.field.to(device=target)
 
 
 def parse(command: Any, args: Sequence[str], default: Any = tyro.MISSING) -> Any:

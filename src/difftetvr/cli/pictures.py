@@ -1,91 +1,21 @@
-"""The commands that draw: ``difftetvr render | compare | cut``."""
+"""The commands that draw models beside each other or cut open: ``difftetvr compare | cut``."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import torch
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from difftetvr.cli.options import CaptureOptions, Output, load_model
-from difftetvr.errors import CameraError, CaptureError
+from difftetvr.errors import CaptureError
 from difftetvr.files import require_writable
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from difftetvr.mesh.tetmesh import TetMesh
-    from difftetvr.render.camera import Camera
-
-# Where the default camera stands, seen from the mesh: in front, to the right, a little above.
-_DEFAULT_DIRECTION = (0.45, -1.0, 0.35)
 _MOST_PIXELS = 16384  # of a cut's side
-
-
-@dataclass(frozen=True)
-class Render:
-    """Render a picture of a reconstructed volume."""
-
-    model: Annotated[Path, Positional, arg(metavar="MODEL")]
-    """Mesh with color and density: .vtu, .vtk, .msh, .npz."""
-    output: Output
-    """The picture, .png."""
-    eye: tuple[float, float, float] | None = None
-    """Position of the camera; default: far enough away that the whole mesh is seen."""
-    target: tuple[float, float, float] | None = None
-    """Point in the middle of the picture; default: the centre of the mesh."""
-    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    """Direction that points upwards in the picture."""
-    fov: float = 53.13
-    """Vertical field of view in degrees."""
-    width: int = 512
-    """Pixels."""
-    height: int = 512
-    """Pixels."""
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Linear R G B behind the volume."""
-    device: str | None = None
-    """Where to render, such as cpu or cuda; default: the best that works."""
-
-    def run(self, console: Console) -> None:
-        """Renders and writes the picture."""
-        from difftetvr.render import render
-        from difftetvr.view.pictures import require_png, save_png
-
-        require_png(self.output)
-        require_writable(self.output, CaptureError)
-        self._require_valid_camera()
-        mesh, field_on_mesh = load_model(self.model, self.device)
-        with torch.no_grad():
-            image = render(mesh, field_on_mesh, self._camera(mesh), background=torch.tensor(self.background))
-        save_png(self.output, image.color)
-        console.print(f"Wrote {self.output} ({self.width} x {self.height})")
-
-    def _require_valid_camera(self) -> None:
-        if not 0.0 < self.fov < 180.0:
-            raise CameraError(f"--fov is {self.fov:g} degrees; it must lie between 0 and 180.")
-        for name in ("eye", "target", "up", "background"):
-            values = getattr(self, name)
-            if values is not None and not all(math.isfinite(v) for v in values):
-                given = " ".join(f"{v:g}" for v in values)
-                raise CameraError(f"--{name} is {given}; give three finite numbers.")
-
-    def _camera(self, mesh: TetMesh) -> Camera:
-        from difftetvr.render.camera import Camera
-
-        lower, upper = mesh.bounds().double().cpu()
-        target = torch.tensor(self.target, dtype=torch.float64) if self.target else 0.5 * (lower + upper)
-        eye = torch.tensor(self.eye, dtype=torch.float64) if self.eye else None
-        fov_y = math.radians(self.fov)
-        if eye is None:
-            direction = torch.tensor(_DEFAULT_DIRECTION, dtype=torch.float64)
-            narrow = 2.0 * math.atan(math.tan(0.5 * fov_y) * min(1.0, self.width / max(self.height, 1)))
-            radius = 0.5 * (upper - lower).norm()
-            eye = target + radius / max(math.sin(0.5 * narrow), 1e-6) * direction / direction.norm()
-        return Camera.look_at(eye, target, self.up, fov_y, self.width, self.height)
 
 
 @dataclass(frozen=True)

@@ -42,6 +42,7 @@ class Checkpoint:
         budget: Cells that the mesh may have.
         strategy: Name of the refinement strategy's class.
         history: Losses and timings up to here.
+        repair: What mending the initial mesh changed, in words; None where it was not mended.
         source: What to call it in messages; the file that it was read from.
     """
 
@@ -52,6 +53,7 @@ class Checkpoint:
     budget: int
     strategy: str
     history: History
+    repair: str | None = None
     source: str = field(default="checkpoint", compare=False)
 
     def save(self, path: Path) -> None:
@@ -67,6 +69,7 @@ class Checkpoint:
             "capture": self.capture,
             "budget": self.budget,
             "strategy": self.strategy,
+            "repair": self.repair,
             **self.history.events(),
         }
         tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in self.tensors.items()}
@@ -173,7 +176,9 @@ def _checkpoint(state: dict[str, Any], tensors: dict[str, torch.Tensor], source:
     if not isinstance(capture, dict):
         raise TypeError("it does not describe its images")
     budget, strategy = int(state["budget"]), str(state["strategy"])
-    return Checkpoint(iteration, config, capture, tensors, budget, strategy, history, source)
+    # Absent from checkpoints of before there were initial meshes.
+    repair = None if state.get("repair") is None else str(state["repair"])
+    return Checkpoint(iteration, config, capture, tensors, budget, strategy, history, repair, source)
 
 
 def _checksum(state: str, tensors: dict[str, torch.Tensor]) -> str:

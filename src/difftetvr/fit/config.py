@@ -67,6 +67,11 @@ class FitConfig:
     to it, and refinement ends within it."""
     grid: tuple[int, int, int] | None = None
     """Cubes of that grid along x, y and z, 6 tetrahedra each; overrides --cells, unless the mesh is to grow."""
+    initial_mesh: str | None = None
+    """Mesh file to begin with instead of a grid; its colours and densities, if it has any, are the initial ones. It is
+    its own budget; only where it is to grow does --cells say how far."""
+    repair: bool = False
+    """Mend an initial mesh that has flat cells or repeated vertices or cells; without it such a mesh is refused."""
     move: bool = True
     """Whether vertices move."""
     refine: Literal["exchange", "grow", "star", "none"] = "exchange"
@@ -134,6 +139,8 @@ class FitConfig:
             require(min(self.grid) >= 1, "grid", self.grid, "at least 1 cube along each axis")
             fits = math.prod(self.grid) <= MAX_CELLS // _CELLS_PER_CUBE
             require(fits, "grid", self.grid, f"at most {MAX_CELLS // _CELLS_PER_CUBE} cubes in all")
+        require(self.initial_mesh is None or self.grid is None, "grid", self.grid, "left out with an initial mesh")
+        require(self.initial_mesh is not None or not self.repair, "repair", self.repair, "given with an initial mesh")
         named = isinstance(self.background, str)
         valid = self.background in ("black", "white", "random") if named else _is_color(self.background)
         require(valid, "background", self.background, "black, white, random or three values in [0, 1]")

@@ -37,7 +37,7 @@ def fit(
     Args:
         capture: Cameras and images; those of ``capture.test`` are never trained on.
         config: Options; default: those of the Tooth benchmark.
-        mesh: Mesh to begin with; default: the grid of ``config`` over ``capture.bounds``.
+        mesh: Mesh to begin with; default: that of ``config``, a file or the grid over ``capture.bounds``.
         strategy: How the mesh is refined, for strategies of your own; default: as ``config.refine`` says.
         checkpoint: File to save the state to before the first iteration, every ``config.checkpoint_seconds``, after the
             last one, and when interrupted by SIGINT or SIGTERM.
@@ -49,7 +49,9 @@ def fit(
 
     Raises:
         CaptureError: The images do not allow what the options ask for.
-        FitError: The checkpoint cannot be read, written, or is of another run, or the loss is not finite.
+        FitError: The checkpoint cannot be read, written, or is of another run, the initial mesh does not suit the
+            options or the images, or the loss is not finite.
+        MeshError: The file of the initial mesh cannot be read or holds an invalid mesh, or the grid is too large.
         KeyboardInterrupt: The run was interrupted; the checkpoint is saved.
     """
     path = Path(checkpoint) if checkpoint is not None else None
@@ -72,14 +74,15 @@ def prepare(
     Args:
         capture: Cameras and images.
         config: Options.
-        mesh: Mesh to begin with; default: the grid of ``config``.
+        mesh: Mesh to begin with; default: the file or the grid of ``config``.
         strategy: How the mesh is refined; default: as ``config.refine`` says.
         resume_from: Checkpoint to go on from if it exists.
 
     Raises:
         CaptureError: The images do not allow what the options ask for.
-        FitError: The checkpoint cannot be read or is of another run, or the device does not exist.
-        MeshError: The grid is too large.
+        FitError: The checkpoint cannot be read or is of another run, the device does not exist, or the initial mesh
+            does not suit the options or the images.
+        MeshError: The file of the initial mesh cannot be read or holds an invalid mesh, or the grid is too large.
         BackendError: The device has no back end.
     """
     if resume_from is not None and resume_from.exists():

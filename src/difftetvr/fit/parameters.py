@@ -31,13 +31,25 @@ class FieldParameters:
         location: ``"vertex"`` or ``"cell"``, what the N entries belong to.
     """
 
-    def __init__(self, mesh: TetMesh, config: FitConfig, density_unit: float) -> None:
+    def __init__(self, mesh: TetMesh, config: FitConfig, density_unit: float, initial: Field | None = None) -> None:
+        """Values before the first step.
+
+        Args:
+            mesh: What they are values on.
+            config: Options.
+            density_unit: Density per unit length that a parameter of 1 stands for.
+            initial: Field to begin with, at the location of the options; default: the options' initial values.
+        """
         count = mesh.num_vertices if config.location == "vertex" else mesh.num_cells
         device = mesh.vertices.device
         self.location = config.location
         self.density_unit = density_unit
-        self.color = torch.full((count, 3), config.initial_color, device=device).requires_grad_()
-        self.density = torch.full((count,), config.initial_density, device=device).requires_grad_()
+        color = torch.full((count, 3), config.initial_color, device=device)
+        density = torch.full((count,), config.initial_density, device=device)
+        if initial is not None:
+            color.copy_(initial.color.detach())
+            density.copy_(initial.density.detach().double() / density_unit)
+        self.color, self.density = color.requires_grad_(), density.requires_grad_()
         self._optimizer = torch.optim.Adam(
             [self.color, self.density], lr=config.rate, betas=config.betas, eps=_EPSILON, fused=True
         )

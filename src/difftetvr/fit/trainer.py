@@ -18,6 +18,7 @@ from difftetvr.fit.config import FitConfig, grid_cubes
 from difftetvr.fit.errors import FitError
 from difftetvr.fit.evaluation import evaluate, rendered_image, true_image
 from difftetvr.fit.history import History, MoveTotals, RefinementRecord
+from difftetvr.fit.initial import Start, load_start
 from difftetvr.fit.losses import LOSSES
 from difftetvr.fit.metrics import psnr_of_mse
 from difftetvr.fit.parameters import FieldParameters
@@ -48,6 +49,8 @@ class Trainer:
         positions: Vertex positions under optimisation; None where they are fixed.
         iteration: Iterations done.
         history: What happened so far.
+        repair: What mending the initial mesh changed, in words; None where it was not mended.
+        starts_from_field: Whether the initial mesh brought colours and densities along.
     """
 
     def __init__(
@@ -58,21 +61,26 @@ class Trainer:
         Args:
             capture: Images and cameras.
             config: Options.
-            mesh: Mesh to begin with; default: the grid that the options ask for.
+            mesh: Mesh to begin with; default: the file or the grid that the options ask for.
             strategy: How to refine it; default: as the options say.
 
         Raises:
             CaptureError: The background needs alpha that the capture lacks.
-            FitError: The device does not exist or cannot move vertices, or a strategy would refine a field on cells.
+            FitError: The device does not exist or cannot move vertices, a strategy would refine a field on cells, or
+                the initial mesh does not suit the options or the images.
+            MeshError: The file of the initial mesh cannot be read or holds an invalid mesh, or the grid is too large.
         """
         strategy = strategy or config.strategy()
         require_fittable(capture, config, strategy)
         self.capture = capture
         self.config = config
         self.strategy = strategy
-        self._mesh = (mesh or build_grid(capture, config, self.strategy)).to(device=_device_of(config, strategy))
-        self.budget = self._budget(mesh is not None or config.grid is not None)
-        self.parameters = FieldParameters(self._mesh, config, capture.density_unit)
+        start = _start(capture, config, strategy, mesh)
+        self.repair = start.repair
+        self.starts_from_field = start.field is not None
+        self._mesh = start.mesh.to(device=_device_of(config, strategy))
+        self.budget = self._budget(mesh is not None or config.grid is not None or config.initial_mesh is not None)
+        self.parameters = FieldParameters(self._mesh, config, capture.density_unit, start.field)
         self.positions = VertexOptimizer(self._mesh, config.motion) if config.move else None
         self.iteration = 0
         self.history = History()
@@ -130,7 +138,14 @@ class Trainer:
             tensors |= {_POSITIONS + name: tensor for name, tensor in state.items() if name not in tensors}
         strategy = type(self.strategy).__name__
         return Checkpoint(
-            self.iteration, self.config, self._capture_description, tensors, self.budget, strategy, self.history
+            self.iteration,
+            self.config,
+            self._capture_description,
+            tensors,
+            self.budget,
+            strategy,
+            self.history,
+            self.repair,
         )
 
     @staticmethod
@@ -153,6 +168,7 @@ class Trainer:
         trainer.budget = checkpoint.budget
         trainer.iteration = checkpoint.iteration
         trainer.history = checkpoint.history
+        trainer.repair = checkpoint.repair
         return trainer
 
     def progress(self, seconds: float) -> Progress:
@@ -333,6 +349,14 @@ def _device_of(config: FitConfig, strategy: Strategy | None) -> torch.device:
     if config.device is None and device.type in _WITHOUT_DOUBLES and _changes_meshes(config, strategy):
         return resolve_device("cpu")
     return device
+
+
+def _start(capture: Capture, config: FitConfig, strategy: Strategy | None, mesh: TetMesh | None) -> Start:
+    if mesh is not None:
+        return Start(mesh)
+    if config.initial_mesh is not None:
+        return load_start(capture, config, strategy)
+    return Start(build_grid(capture, config, strategy))
 
 
 def build_grid(capture: Capture, config: FitConfig, strategy: Strategy | None) -> TetMesh:

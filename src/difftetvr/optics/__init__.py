@@ -4,5 +4,6 @@ from difftetvr.optics.constant import ConstantPerCell
 from difftetvr.optics.exact import ExactLinear
 from difftetvr.optics.model import OpticalModel
 from difftetvr.optics.subsegments import SubSegments
+from difftetvr.optics.transfer_function import TransferFunction
 
-__all__ = ["ConstantPerCell", "ExactLinear", "OpticalModel", "SubSegments"]
+__all__ = ["ConstantPerCell", "ExactLinear", "OpticalModel", "SubSegments", "TransferFunction"]

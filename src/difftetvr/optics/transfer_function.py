@@ -110,6 +110,13 @@ class TransferFunction:
         return (visible_before[behind] == visible_before[first]) & (self(lower)[1] == 0) & (self(upper)[1] == 0)
 
     @staticmethod
+    def default() -> TransferFunction:
+        """Blue over white to red, the more opaque the greater the scalar: for a first look."""
+        color = [(0.03, 0.09, 0.55), (0.25, 0.55, 0.85), (0.9, 0.9, 0.9), (0.85, 0.4, 0.2), (0.5, 0.02, 0.03)]
+        scalar, opacity = torch.linspace(0.0, 1.0, 5), torch.tensor([0.0, 0.04, 0.12, 0.3, 0.7])
+        return TransferFunction(scalar, opacity, torch.tensor(color), "default")
+
+    @staticmethod
     def load(path: str | Path) -> TransferFunction:
         """Read a ``.json`` or ``.xml`` transfer function, see :meth:`from_json` and :meth:`from_xml`.
 

@@ -129,7 +129,9 @@ def render_adjoint(tracer: Tracer, image: ImageAdjoint, vertex_count: int, wante
     position_count = buffer_length(vertex_count) if wanted.vertices else 0
     transfer = None
     if view.transfer is not None:
-        transfer = TransferGradients(*(dr.zeros(real, dr.width(a)) for a in (view.transfer.knots, view.transfer.values)))
+        transfer = TransferGradients(
+            *(dr.zeros(real, dr.width(a)) for a in (view.transfer.knots, view.transfer.values))
+        )
     gradients = Gradients(
         dr.zeros(real, field_count if transfer else 4 * field_count),
         dr.zeros(real, 4 * position_count) if wanted.vertices else None,
@@ -186,7 +188,9 @@ class _AdjointKernel:
             record = dr.gather(self.view.backend.Float4, self.view.cells, step.cell)
             constant = [record[3], self._radiance([record[0], record[1], record[2]])]
             start, end = [start[0], *constant], [end[0], *constant]
-        ray, at_start, at_end = self._cross(start, end, ray) if self.view.transfer is None else self._cut(start, end, ray)
+        ray, at_start, at_end = (
+            self._cross(start, end, ray) if self.view.transfer is None else self._cut(start, end, ray)
+        )
         if self.view.cells is not None:
             self._scatter_field(step.cell, at_start[1] + at_end[1], at_start[2] + at_end[2], True)
             at_start, at_end = at_start[:1], at_end[:1]

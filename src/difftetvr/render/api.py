@@ -53,7 +53,8 @@ def render(
     """Render a tetrahedral mesh by emission and absorption (article section 3, solved exactly).
 
     Differentiable once in ``mesh.vertices``, the field's tensors (those of its transfer function, too),
-    ``camera.world_to_camera``, ``background`` and ``clip_plane``, as far as these require gradients. Runs on the device and at the precision of ``mesh.vertices``.
+    ``camera.world_to_camera``, ``background`` and ``clip_plane``, as far as these require gradients. Runs on the device
+    and at the precision of ``mesh.vertices``.
 
     Args:
         mesh: Tetrahedral mesh; its vertices' device and dtype (float32 or float64) decide where and how to render.
@@ -120,11 +121,13 @@ def prepare_view(
     content, parts = _content(mesh, field)
     for tensor in parts:
         if tensor.device != mesh.vertices.device:
-            raise MeshError(f"The field is on '{tensor.device}', the mesh on '{mesh.vertices.device}'; move one of them.")
+            raise MeshError(
+                f"The field is on '{tensor.device}', the mesh on '{mesh.vertices.device}'; move one of them."
+            )
     backend = backend_for(mesh.vertices)
     parts = tuple(part.to(backend.dtype) for part in parts)
     if content != "scalar":
-        Field(*parts, content).validate(mesh)
+        Field(parts[0], parts[1], content).validate(mesh)
     if optics is None:
         optics = ConstantPerCell() if content == "cell" else ExactLinear()
     task = RenderTask(backend, mesh, camera, optics, content, transmittance_threshold, deterministic, renderer)

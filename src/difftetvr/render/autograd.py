@@ -117,7 +117,9 @@ class RenderFunction(torch.autograd.Function):
                 backend.floats(distance),
             )
             gradients = render_adjoint(ctx.tracer, image, ctx.vertex_count, Wanted(needs_vertices, needs_limits))
-            vertices = backend.tensor(gradients.vertices).reshape(-1, 4)[: ctx.vertex_count, :3] if needs_vertices else None
+            vertices = (
+                backend.tensor(gradients.vertices).reshape(-1, 4)[: ctx.vertex_count, :3] if needs_vertices else None
+            )
             limits = backend.tensor(gradients.limits, *distance.shape, 2) if needs_limits else None
             parts: tuple[torch.Tensor, ...]
             if gradients.transfer is None:
@@ -125,6 +127,10 @@ class RenderFunction(torch.autograd.Function):
                 parts = field[:, :3], field[:, 3]
             else:
                 values = backend.tensor(gradients.transfer.values).reshape(-1, 4)
-                parts = backend.tensor(gradients.field)[: ctx.part_size], backend.tensor(gradients.transfer.knots), values
+                parts = (
+                    backend.tensor(gradients.field)[: ctx.part_size],
+                    backend.tensor(gradients.transfer.knots),
+                    values,
+                )
         wanted = (part if needed else None for part, needed in zip(parts, ctx.needs_input_grad[3:], strict=True))
         return None, vertices, limits, *wanted

@@ -1,13 +1,14 @@
 """One front-to-back order of all cells of a mesh for a whole view, as the projected-tetrahedra renderer composites.
 
-Of two cells that share a face, the one on the eye's side of its plane comes first. In a convex mesh these relations order
-all cells that a ray from the eye meets, as it passes from each to the next through a face. Sorting by the power of the eye
-with respect to the circumspheres satisfies all of them in a Delaunay mesh (Edelsbrunner, "An acyclicity theorem for cell
-complexes in d dimensions", 1990; Max, Hanrahan & Crawfis, "Area and volume coherence for efficient visualization of 3D
-scalar functions", 1990) - in exact arithmetic, and but for ties: the six cells of a grid's cube have one circumsphere,
-and the power of a thin cell is mostly rounding. So the power only says where to start, and what the faces say is
-enforced: a cell that is not behind all its predecessors is moved right behind the last of them, and so are, in turn,
-cells behind it. Whether that ends is known afterwards. No tolerance decides, and the mesh need not be Delaunay.
+Of two cells that share a face, the one on the eye's side of its plane comes first. In a convex mesh these relations
+order all cells that a ray from the eye meets, as it passes from each to the next through a face. In a Delaunay mesh,
+sorting by the power of the eye with respect to the circumspheres satisfies them all (Edelsbrunner, "An acyclicity
+theorem for cell complexes in d dimensions", 1990; Max, Hanrahan & Crawfis, "Area and volume coherence for efficient
+visualization of 3D scalar functions", 1990). That is so in exact arithmetic, and but for ties: the six cells of a
+grid's cube have one circumsphere, and the power of a thin cell is mostly rounding. So the power only says where to
+start, and what the faces say is enforced: a cell that is not behind all its predecessors is moved right behind the last
+of them, and so are, in turn, cells behind it. Whether that ends is known afterwards. No tolerance decides, and the mesh
+need not be Delaunay.
 """
 
 from __future__ import annotations
@@ -26,14 +27,12 @@ _MAX_ROUNDS = 200
 _MAX_MOVES = 2
 """Moves per cell, on the average, before all of them take turns."""
 
-_FAR_CENTER = 2.0
-"""Circumcentres farther away than this, in units of the cell's longest edge, say more about rounding than about place."""
+_SURE = 0.05
+"""How far, in units of its longest edge, rounding may move the centre of a cell's circumsphere for it to count."""
 
 _SIGN_CERTAIN = 16.0 * 2.0**-52
 """Rounding of a face's distance from the eye, times the face's area, in units of edge length times distance squared."""
 
-import os
-SURE=float(os.environ.get("SURE",0.1)); FARC=float(os.environ.get("FARC",17))
 _FIRST = -(2**63)
 _EXPONENT_AND_FRACTION = 2**63 - 1
 
@@ -56,8 +55,8 @@ def visibility_order(mesh: TetMesh, vertices: torch.Tensor) -> CellOrder:
     """Order the cells of a mesh front to back, for all rays from the eye at once.
 
     The order is exact for convex meshes unless cells overlap cyclically as seen from the eye, which in Delaunay meshes
-    they never do. In other meshes it is right along every stretch of a ray that does not leave the mesh, and across gaps
-    if the cells are part of a Delaunay mesh. Loose cells are sorted by the distance of their centroids.
+    they never do. In other meshes it is right along every stretch of a ray that does not leave the mesh, and across
+    gaps if the cells are part of a Delaunay mesh. Loose cells are sorted by the distance of their centroids.
 
     Args:
         mesh: The cells, and their positions in any frame.
@@ -69,13 +68,13 @@ def visibility_order(mesh: TetMesh, vertices: torch.Tensor) -> CellOrder:
     positions = _in_unit_range(vertices)
     if not mesh.is_conforming:
         return CellOrder(torch.argsort(_squared_distances(positions, mesh.tets)), exact=False)
-    keys, predecessors = _keys_and_predecessors(positions, mesh)
+    keys, predecessors = _keys_and_predecessors(positions, mesh, torch.finfo(vertices.dtype).eps)
     acyclic = _move_behind_predecessors(keys, predecessors, mesh.topology.cell_adjacency)
     return CellOrder(torch.argsort(keys[:-1]), acyclic and is_convex(mesh.vertices, mesh.topology))
 
 
 def _in_unit_range(vertices: torch.Tensor) -> torch.Tensor:
-    """Positions in float64 and in a unit in which no power of them over- or underflows."""
+    """Positions in float64, scaled by a power of two to be at most 1, so that their products stay in range."""
     positions = vertices.detach().double()
     _, exponent = torch.frexp(positions.abs().max())
     return positions * torch.exp2(-exponent.double().clamp(-1000, 1000))
@@ -83,38 +82,44 @@ def _in_unit_range(vertices: torch.Tensor) -> torch.Tensor:
 
 def _squared_distances(positions: torch.Tensor, tets: torch.Tensor) -> torch.Tensor:
     """(T,) squared distances of the cells' centroids from the eye, times 16."""
-    parts = [positions[tets[part]].sum(1).square().sum(1) for part in chunks(tets.shape[0], tets.device, width=12)]
+    parts = []
+    for part in chunks(tets.shape[0], tets.device, width=3):
+        a, b, c, d = (positions.index_select(0, column) for column in tets[part].unbind(1))
+        parts.append((a + b + c + d).square().sum(1))
     return torch.cat(parts)
 
 
-def _keys_and_predecessors(positions: torch.Tensor, mesh: TetMesh) -> tuple[torch.Tensor, torch.Tensor]:
+def _keys_and_predecessors(
+    positions: torch.Tensor, mesh: TetMesh, rounding: float
+) -> tuple[torch.Tensor, torch.Tensor]:
     """What to sort cells by unless faces object, and the cells that have to come before each.
 
     Args:
-        positions: (V, 3) float64 in camera space.
+        positions: (V, 3) float64 in camera space, at most 1.
         mesh: The cells.
+        rounding: By how much the positions may be off.
 
     Returns:
         keys: (T + 1,) int64; the last belongs to no cell, and is below all others.
-        predecessors: (T, 4) int64, the cell across the face opposite local vertex k if it is nearer, else T.
+        predecessors: (T, 4) int32, the cell across the face opposite local vertex k if it is nearer, else T.
     """
-    noise = positions.abs().max() * torch.finfo(mesh.vertices.dtype).eps
     count, tets, adjacency = mesh.num_cells, mesh.tets, mesh.topology.cell_adjacency
     keys = torch.full((count + 1,), _FIRST, dtype=torch.int64, device=tets.device)
-    predecessors = torch.empty((count, 4), dtype=torch.int64, device=tets.device)
+    predecessors = torch.empty((count, 4), dtype=torch.int32, device=tets.device)
     for part in chunks(count, tets.device, width=4):
         cells = CellShape.of(positions, tets[part])
-        keys[part] = _ordered_bits(_eye_powers(cells, noise))
+        keys[part] = _ordered_bits(_eye_powers(cells, rounding))
         neighbors = adjacency[part]
         predecessors[part] = torch.where(_eye_is_beyond(cells).t() & (neighbors >= 0), neighbors, count)
     return keys, predecessors
 
 
-def _eye_powers(cells: CellShape, noise: torch.Tensor) -> torch.Tensor:
+def _eye_powers(cells: CellShape, rounding: float) -> torch.Tensor:
     """(N,) power of the eye with respect to each circumsphere, |center|^2 - radius^2.
 
-    Where `noise` in the positions moves the centre by a good part of the cell's size, the sphere around the centroid with the mean square distance of the corners stands in,
-    if the eye's power is smaller there: a cell too far in front is soon moved back, one too far behind moves many.
+    Where rounding of the positions moves the centre too far, the sphere around the centroid with the mean square
+    distance of the corners stands in, if the eye's power is smaller there: a cell too far in front is soon moved back,
+    one too far behind moves many.
     """
     diameters = cells.diameters()
     powers = dot(cells.origin, cells.origin + diameters)
@@ -122,8 +127,8 @@ def _eye_powers(cells: CellShape, noise: torch.Tensor) -> torch.Tensor:
     centroid = cells.origin + spread
     stand_in = dot(centroid, centroid) + dot(spread, spread) - cells.squares.sum(0) / 4.0
     longest = cells.squares.amax(0).sqrt()
-    sizes = dot(diameters, diameters).sqrt() + longest
-    sure = (noise * sizes * longest < SURE * cells.determinants) & (sizes < FARC * longest)
+    reach = dot(diameters, diameters).sqrt() + longest
+    sure = rounding * reach * longest < _SURE * cells.determinants
     return torch.where(sure, powers, torch.fmin(powers, stand_in))
 
 
@@ -133,7 +138,7 @@ def _eye_is_beyond(cells: CellShape) -> torch.Tensor:
     Cells that rounding turned inside out do not know in from out and say False.
     """
     beside = [dot(normal, cells.origin) for normal in cells.normals]
-    opposite = -(sum(beside, cells.determinants))
+    opposite = -sum(beside, cells.determinants)
     longest = cells.squares.amax(0).sqrt()
     reach = dot(cells.origin, cells.origin).sqrt() + longest
     certain = torch.stack((opposite, *beside)) > _SIGN_CERTAIN * longest * reach.square()

@@ -16,8 +16,8 @@ import drjit as dr
 from difftetvr.backend import Backend
 from difftetvr.optics import OpticalModel
 from difftetvr.render.camera import Camera
-from difftetvr.render.transfer import Transfer
 from difftetvr.render.rays import Frame, Pinhole, lane_count, lane_pixel, pixel_frame
+from difftetvr.render.transfer import Transfer
 from difftetvr.render.walk import Corner, Exit, Face, find_exit, interpolate, make_face
 
 

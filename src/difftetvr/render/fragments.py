@@ -1,8 +1,8 @@
 """Per-pixel linked lists of fragments (article section 4; Yang et al. 2010), built by rasterising faces (Dr.Jit).
 
-A fragment is a face through which a ray enters a cell, so it stands for the whole crossing of that cell: which face the
-ray leaves through follows from the exact rule of the walk. Every crossing makes one fragment, on any mesh; an order that
-rounding has mixed up costs as little as the crossings concerned are long.
+A fragment is a face through which a ray enters a cell, so it stands for the whole crossing of that cell: which face
+the ray leaves through follows from the exact rule of the walk. Every crossing makes one fragment, on any mesh; an order
+that rounding has mixed up costs as little as the crossings concerned are long.
 """
 
 from __future__ import annotations

@@ -10,8 +10,8 @@ from difftetvr.errors import DiffTetError, MeshError
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.render.api import as_background, compose, prepare_view
 from difftetvr.render.camera import Camera
-from difftetvr.render.hats import RECORD, HatImage, hat_records
 from difftetvr.render.forward import render_forward
+from difftetvr.render.hats import RECORD, HatImage, hat_records
 
 _TINY = 1e-30
 

@@ -1,7 +1,7 @@
 """The linked-list renderer: fragments of every pixel, sorted front to back (article section 4; Dr.Jit).
 
-Each ray sorts its fragments by a heap in local memory. When a list is longer than that memory, the nearest fragments are
-taken first and the list is gone through again for those behind them, so nothing is dropped, whatever the depth
+Each ray sorts its fragments by a heap in local memory. When a list is longer than that memory, the nearest fragments
+are taken first and the list is gone through again for those behind them, so nothing is dropped, whatever the depth
 complexity. The image is made in bands when the lists of all pixels together would be too large.
 """
 
@@ -137,8 +137,8 @@ class _Heap:
             self._sink(self.root, key, dr.select(nearer, uint(self.size), 0))
             return following(node), self.depths, self.faces
 
-        state = (node, self.depths, self.faces)
-        _, self.depths, self.faces = dr.while_loop(state, lambda node, *_: node != NONE, replace)
+        rest = (node, self.depths, self.faces)
+        _, self.depths, self.faces = dr.while_loop(rest, lambda node, *_: node != NONE, replace)
         return count
 
     def _heapify(self, count: Any) -> None:

@@ -21,7 +21,7 @@ from difftetvr.render.cell_order import visibility_order
 from difftetvr.render.crossing import Kernel, Rays, View, cross_cell, make_rays
 from difftetvr.render.entry_table import HalfFaceScene
 from difftetvr.render.rays import edge_function, is_left
-from difftetvr.render.tiles import TILE_BITS, Tiler, TileLists
+from difftetvr.render.tiles import TILE_BITS, TileLists, Tiler
 
 PAIR_BUDGET = 1 << 23
 """Pairs of cell and tile that are held at a time."""

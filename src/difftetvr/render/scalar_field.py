@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
 
@@ -17,8 +18,8 @@ from difftetvr.optics.transfer_function import TransferFunction
 class ScalarField:
     """A scalar, linear between vertices or constant in cells, and what it looks like.
 
-    The transfer function is applied to the interpolated scalar everywhere along a ray, not to the vertices' values: thin
-    features of it show however coarse the mesh is. Gradients reach the scalars, the knots' values and their positions.
+    The transfer function is applied to the interpolated scalar everywhere along a ray, not to the vertices' values, so
+    its thin features show however coarse the mesh is. Gradients reach the scalars, the knots' values and their places.
 
     Attributes:
         scalar: (V,) per vertex or (T,) per cell, float32 or float64, finite; may require grad.
@@ -84,6 +85,10 @@ class ScalarField:
         """
         color, opacity = self.transfer_function(self.normalised())
         return Field(color, self.attenuation * opacity, self.location)
+
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> ScalarField:
+        """The same scalars on another device or in another precision; autograd sees them as a function of these."""
+        return dataclasses.replace(self, scalar=self.scalar.to(device=device, dtype=dtype))
 
     def knots(self, like: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """(K,) scalars and (K, 4) densities and linear RGB of the transfer function; differentiable.

@@ -172,9 +172,7 @@ class PieceAdjoint:
         self.length = t1 - t0
         self.inverse_rise = dr.select(f1 != f0, 1.0 / (f1 - f0), 0.0)
 
-    def add(
-        self, at_start: list[Any], at_end: list[Any], pixel: list[Any], total: CrossingAdjoint
-    ) -> CrossingAdjoint:
+    def add(self, at_start: list[Any], at_end: list[Any], pixel: list[Any], total: CrossingAdjoint) -> CrossingAdjoint:
         """Add a piece's part.
 
         Args:

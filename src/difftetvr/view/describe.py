@@ -12,6 +12,7 @@ from rich.text import Text
 
 from difftetvr.capture.capture import Capture
 from difftetvr.fit.evaluation import Evaluation
+from difftetvr.mesh.delaunay_check import is_convex, is_delaunay
 from difftetvr.mesh.field import Field
 from difftetvr.mesh.tetmesh import TetMesh
 
@@ -32,20 +33,26 @@ class _Bar:
         return Measurement(self.length, self.length)
 
 
-def mesh_tables(name: str, mesh: TetMesh, field: Field | None) -> list[Table]:
+def mesh_tables(name: str, mesh: TetMesh, field: Field | None, flat_cells: int | None = None) -> list[Table]:
     """Size, bounds and attributes of a mesh, and the histogram of its cells' quality Q.
 
     Args:
         name: Title, such as the file's name.
         mesh: The mesh.
         field: Its colours and densities, if it has any.
+        flat_cells: Number of cells without volume that were left out of it, if known.
     """
     lower, upper = mesh.bounds().tolist()
     boundary = mesh.topology.boundary_faces.shape[0]
     table = _table(name)
     table.add_row("cells", f"{mesh.num_cells:,}")
+    if flat_cells is not None:
+        table.add_row("flat cells", f"{flat_cells:,}, left out" if flat_cells else "none")
     table.add_row("vertices", f"{mesh.num_vertices:,}")
     table.add_row("boundary faces", f"{boundary:,}")
+    convex = is_convex(mesh.vertices, mesh.topology)
+    table.add_row("convex", "yes" if convex else "no")
+    table.add_row("Delaunay", "yes" if convex and is_delaunay(mesh.vertices, mesh.topology) else "no")
     table.add_row("bounds", f"{_point(lower)} to {_point(upper)}")
     table.add_row("volume", f"{float(mesh.volumes().double().sum()):.6g}")
     if field is None:
@@ -57,6 +64,28 @@ def mesh_tables(name: str, mesh: TetMesh, field: Field | None) -> list[Table]:
     return [table, _quality_table(mesh)]
 
 
+def data_table(point_data: dict[str, torch.Tensor], cell_data: dict[str, torch.Tensor]) -> Table | None:
+    """Place, components and range of a mesh's data.
+
+    Args:
+        point_data: Arrays of one row for each vertex.
+        cell_data: Arrays of one row for each cell.
+
+    Returns:
+        The table; None where there are no data.
+    """
+    if not point_data and not cell_data:
+        return None
+    table = Table(title="data", title_justify="left")
+    for column in ("name", "per", "components", "range"):
+        table.add_column(column, justify="right" if column == "components" else "left", overflow="fold")
+    for place, arrays in (("vertex", point_data), ("cell", cell_data)):
+        for name, values in arrays.items():
+            shape = " x ".join(str(n) for n in values.shape[1:]) or "1"
+            table.add_row(Text(name), place, shape, _finite_range(values))
+    return table
+
+
 def capture_table(name: str, capture: Capture) -> Table:
     """Number and size of the images, split and bounds of a capture."""
     count, height, width, _ = capture.images.shape
@@ -65,6 +94,9 @@ def capture_table(name: str, capture: Capture) -> Table:
     table.add_row("views", f"{count} ({len(capture.train_indices)} training, {len(capture.test_indices)} held out)")
     table.add_row("image size", f"{width} x {height}")
     table.add_row("alpha", "known" if capture.alphas is not None else "unknown")
+    table.add_row("colours", "linear" if capture.encoding == "linear" else "sRGB-encoded, as stored")
+    if capture.points is not None:
+        table.add_row("sparse points", f"{capture.points.shape[0]:,}")
     table.add_row("bounds", f"{_point(lower)} to {_point(upper)}")
     table.add_row("density unit", f"{capture.density_unit:g} per unit length")
     return table
@@ -107,6 +139,16 @@ def _table(title: str) -> Table:
 
 def _point(values: list[float]) -> str:
     return "(" + ", ".join(f"{v:.4g}" for v in values) + ")"
+
+
+def _finite_range(values: torch.Tensor) -> str:
+    if not values.is_floating_point():
+        return f"{int(values.min())} to {int(values.max())}"
+    finite = values[values.isfinite()]
+    if not finite.numel():
+        return "no finite values"
+    missing = values.numel() - finite.numel()
+    return _range(finite) + (f", {missing:,} not finite" if missing else "")
 
 
 def _range(values: torch.Tensor) -> str:

@@ -1,0 +1,122 @@
+"""`render`: scalars through transfer functions, clip planes, the three renderers, statistics."""
+
+import numpy as np
+import pytest
+from commands.helpers import fails
+from PIL import Image
+
+import difftetvr as dtv
+import difftetvr.cli as cli
+
+SMALL = ["--width", "24", "--height", "20", "--device", "cpu"]
+
+
+@pytest.fixture
+def simulation(tmp_path):
+    """A mesh with a pressure and a velocity, and no colours."""
+    mesh = dtv.TetMesh.grid((3, 3, 3))
+    path = tmp_path / "flow.npz"
+    points = mesh.vertices.numpy()
+    velocity = np.stack([points[:, 0], 0 * points[:, 0], points[:, 2]], 1)
+    np.savez(path, vertices=points, tets=mesh.tets.numpy(), pressure=points[:, 2], velocity=velocity)
+    return path
+
+
+def render(*args):
+    """The picture that a successful command writes, (H, W, 3) in [0, 1]."""
+    args = [str(a) for a in args]
+    assert cli.main(["render", *args]) == 0
+    return np.asarray(Image.open(args[args.index("-o") + 1]).convert("RGB")) / 255.0
+
+
+def test_scalar_with_the_default_transfer_function(simulation, tmp_path, capsys):
+    picture = render(simulation, "-o", tmp_path / "a.png", "--scalar", "pressure", *SMALL)
+    assert picture.shape == (20, 24, 3) and picture.max() > 0.2
+    assert "pressure" in capsys.readouterr().out
+    # Red is for the high values above, blue for the low ones below.
+    assert picture[:9, :, 0].sum() > picture[:9, :, 2].sum()
+    assert picture[-8:, :, 0].sum() < picture[-8:, :, 2].sum()
+
+
+def test_the_picture_is_that_of_the_library(simulation, tmp_path):
+    function = dtv.TransferFunction([0.0, 0.5, 1.0], [0.0, 0.8, 0.1], [[1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    function.save(tmp_path / "tf.json")
+    eye, target = (0.5, -2.0, 0.8), (0.5, 0.5, 0.5)
+    given = ["--scalar", "pressure", "--transfer-function", tmp_path / "tf.json", "--attenuation", "9"]
+    given += ["--value-range", "0.2", "0.9", "--eye", *eye, "--target", *target, "--clip", "-1", "0", "0", "0.5"]
+    picture = render(simulation, "-o", tmp_path / "a.png", *given, *SMALL)
+    mesh = dtv.TetMesh.grid((3, 3, 3))
+    field = dtv.ScalarField(mesh.vertices[:, 2], function, 9.0, (0.2, 0.9))
+    camera = dtv.Camera.look_at(eye, target, (0.0, 0.0, 1.0), np.radians(53.13), 24, 20)
+    image = dtv.render(mesh, field, camera, clip_plane=(-1.0, 0.0, 0.0, 0.5)).color
+    from difftetvr.view.pictures import to_picture
+
+    assert np.array_equal(picture, np.asarray(to_picture(image)) / 255.0)
+
+
+def test_all_renderers_write_the_same_picture(simulation, tmp_path):
+    given = ["--scalar", "velocity", *SMALL]
+    pictures = [
+        render(simulation, "-o", tmp_path / f"{name}.png", "--renderer", name, *given)
+        for name in ("marching", "linked-list", "projected")
+    ]
+    assert pictures[0].max() > 0.2
+    for picture in pictures[1:]:
+        assert np.abs(picture - pictures[0]).max() <= 1 / 255
+
+
+@pytest.mark.parametrize(("show", "found"), [("depth-complexity", "cells a ray"), ("cell-quality", "worst quality")])
+def test_statistics(simulation, tmp_path, capsys, show, found):
+    picture = render(simulation, "-o", tmp_path / "a.png", "--show", show, *SMALL)
+    assert found in capsys.readouterr().out
+    # One pixel for each ray, the scale beside them.
+    assert picture.shape[0] >= 20 and picture.shape[1] > 24
+    assert len(np.unique(picture[:20, :24].reshape(-1, 3), axis=0)) > 1
+
+
+def test_bad_scalars(simulation, tmp_path, capsys):
+    given = ["-o", tmp_path / "a.png", *SMALL]
+    assert "pressure, velocity" in fails(capsys, "render", simulation, *given)
+    assert "no scalar 'heat' (found: pressure, velocity)" in fails(
+        capsys, "render", simulation, "--scalar", "heat", *given
+    )
+    assert "range" in fails(capsys, "render", simulation, "--scalar", "pressure", "--value-range", 1, 0, *given)
+    assert "attenuation" in fails(capsys, "render", simulation, "--scalar", "pressure", "--attenuation", -1, *given)
+    missing = tmp_path / "none.json"
+    assert "none.json" in fails(
+        capsys, "render", simulation, "--scalar", "pressure", "--transfer-function", missing, *given
+    )
+    assert "clip_plane" in fails(capsys, "render", simulation, "--scalar", "pressure", "--clip", 0, 0, 0, 1, *given)
+    assert not (tmp_path / "a.png").exists()
+
+
+def test_constant_scalar_and_no_scalar(tmp_path, capsys):
+    mesh = dtv.TetMesh.grid((1, 1, 1))
+    arrays = {"vertices": mesh.vertices.numpy(), "tets": mesh.tets.numpy()}
+    np.savez(tmp_path / "constant.npz", heat=np.ones(8), **arrays)
+    np.savez(tmp_path / "bare.npz", **arrays)
+    assert "1 everywhere" in fails(capsys, "render", tmp_path / "constant.npz", "-o", tmp_path / "a.png")
+    assert "no scalars" in fails(capsys, "render", tmp_path / "bare.npz", "-o", tmp_path / "a.png")
+
+
+def test_real_meshes(shared_data, tmp_path, capsys):
+    """One command each, with a word about flat cells."""
+    meshes = shared_data / "meshes"
+    assert render(meshes / "post.vtk", "-o", tmp_path / "a.png", *SMALL).max() > 0.1
+    assert render(meshes / "bluntfin.npz", "--scalar", "density", "-o", tmp_path / "b.png", *SMALL).max() > 0.02
+    assert "77 of 187,395 cells have no volume" in capsys.readouterr().out
+    assert "split" in fails(capsys, "render", meshes / "hexa.vtk", "-o", tmp_path / "c.png")
+    assert render(meshes / "hexa.vtk", "--split", "-o", tmp_path / "c.png", *SMALL).max() > 0.1
+
+
+def test_scalar_of_a_mesh_with_colours(tmp_path):
+    """A named scalar is shown even where the file has colours; without a name the colours are."""
+    mesh = dtv.TetMesh.grid((2, 2, 2))
+    field = {"color": np.tile([0, 1, 0], (mesh.num_vertices, 1)).astype(np.float32)}
+    field["density"] = np.full(mesh.num_vertices, 9, np.float32)
+    heat = np.linspace(0, 1, mesh.num_vertices)
+    path = tmp_path / "both.npz"
+    np.savez(path, vertices=mesh.vertices.numpy(), tets=mesh.tets.numpy(), heat=heat, **field)
+    green = render(path, "-o", tmp_path / "a.png", *SMALL)
+    assert green[..., 1].max() > 0.5 and green[..., 0].max() == 0
+    assert render(path, "-o", tmp_path / "b.png", "--scalar", "heat", *SMALL)[..., 0].max() > 0
