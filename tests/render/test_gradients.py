@@ -292,3 +292,33 @@ def test_a_perturbed_pose_is_found_again_by_gradient_descent() -> None:
         losses.append(loss.item())
     assert losses[-1] < 0.1 * losses[0]
     assert float(twist.detach().norm()) < 0.5 * float(start.norm())
+
+
+@pytest.mark.parametrize("per_cell", [False, True])
+def test_directional_colours(per_cell: bool) -> None:
+    """Harmonics change the image with the direction, and gradients reach them, the positions and the pose."""
+    scene = SCENES["delaunay-cells" if per_cell else "delaunay"]()
+    mesh = TetMesh(scene.vertices.double(), scene.tets)
+    generator = torch.Generator().manual_seed(4)
+    harmonics = 0.1 * torch.randn(scene.color.shape[0], 8, 3, generator=generator, dtype=torch.float64)
+    values = {"vertices": mesh.vertices, "color": scene.color.double() + 0.5, "harmonics": harmonics}
+    values["pose"] = scene.camera.world_to_camera.double()
+    values = {key: value.clone().requires_grad_() for key, value in values.items()}
+    weights = torch.randn(scene.camera.height, scene.camera.width, 3, generator=generator, dtype=torch.float64)
+    location = "cell" if per_cell else "vertex"
+
+    def loss(v: dict[str, Tensor]) -> Tensor:
+        field = Field(v["color"], scene.density.double(), location, v["harmonics"])
+        return (
+            weights * render(mesh.with_vertices(v["vertices"]), field, scene.camera.with_pose(v["pose"])).color
+        ).sum()
+
+    loss(values).backward()
+    for key, value in values.items():
+        step = torch.randn(value.shape, generator=generator, dtype=torch.float64)
+        if key == "pose":
+            step[3] = 0.0
+        ahead, behind = (loss(values | {key: value.detach() + sign * 1e-6 * step}) for sign in (1, -1))
+        assert value.grad is not None
+        analytic = float((value.grad * step).sum())
+        assert abs(float(ahead.detach() - behind.detach()) / 2e-6 - analytic) < 1e-5 * abs(analytic) + 1e-7, key

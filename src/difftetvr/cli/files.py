@@ -71,12 +71,12 @@ class Info:
         if _is_capture(path):
             console.print(capture_table(self.file, self.views_of.load(self.file, console)))
             return
-        from difftetvr.mesh.io import FIELD_ARRAYS
+        from difftetvr.mesh.io import FIELD_ARRAYS, HARMONICS
 
         data = self.reading.load(path, console)
         for table in mesh_tables(self.file, data.mesh, data.field, data.flat_cells):
             console.print(table)
-        shown = FIELD_ARRAYS if data.field is not None else ()
+        shown = (*FIELD_ARRAYS, HARMONICS) if data.field is not None else ()
         others = [{n: v for n, v in d.items() if n not in shown} for d in (data.point_data, data.cell_data)]
         if (table_of_data := data_table(*others)) is not None:
             console.print(table_of_data)
@@ -96,7 +96,7 @@ class Export:
 
     def run(self, console: Console) -> None:
         """Reads and writes."""
-        from difftetvr.mesh.io import FIELD_ARRAYS, require_writable_format, save
+        from difftetvr.mesh.io import FIELD_ARRAYS, HARMONICS, require_writable_format, save
 
         require_writable_format(self.output, with_field=False)
         require_writable(self.output, MeshError)
@@ -106,6 +106,8 @@ class Export:
             require_writable_format(self.output)
         save(self.output, data.mesh, field_on_mesh)
         written = () if field_on_mesh is None else FIELD_ARRAYS
+        if field_on_mesh is not None and field_on_mesh.harmonics is not None:
+            written = (*written, HARMONICS)
         left_out = sorted({*data.point_data, *data.cell_data}.difference(written))
         content = " and ".join(written) or "geometry only"
         without = f", without {', '.join(left_out)}" if left_out else ""

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 
 from difftetvr.errors import MeshError
+from difftetvr.mesh.harmonics import COUNTS, harmonic_basis
 
 if TYPE_CHECKING:
     from difftetvr.mesh.tetmesh import TetMesh
@@ -23,6 +24,9 @@ class Field:
         color: (V, 3) per vertex or (T, 3) per cell; emitted linear RGB, float32 or float64, may require grad.
         density: (V,) or (T,) extinction per unit length, >= 0, of the same length; may require grad.
         location: "vertex" or "cell"; None lets the lengths decide, vertices first where both fit.
+        harmonics: (V, B, 3) or (T, B, 3) coefficients of the spherical harmonics that are added to ``color``, with B 3,
+            8 or 15 for bands up to 1, 2 or 3 (see `difftetvr.mesh.harmonics`); None for colours that are the same
+            from all sides. Seen from the camera, a colour never falls below 0. May require grad.
 
     Raises:
         MeshError: The shapes do not belong together, the values are no real numbers, or the location is unknown.
@@ -31,6 +35,7 @@ class Field:
     color: torch.Tensor
     density: torch.Tensor
     location: Location | None = None
+    harmonics: torch.Tensor | None = None
 
     def __post_init__(self) -> None:
         color = _as_floats(self.color, "color")
@@ -44,6 +49,15 @@ class Field:
             )
         if self.location not in (None, "vertex", "cell"):
             raise MeshError(f'The field\'s location is {self.location!r}; pass "vertex", "cell" or None.')
+        if self.harmonics is not None:
+            harmonics = _as_floats(self.harmonics, "harmonics")
+            counts = {(len(color), count, 3) for count in COUNTS[1:]}
+            if tuple(harmonics.shape) not in counts:
+                raise MeshError(
+                    f"The field's harmonics have shape {tuple(harmonics.shape)}; pass ({len(color)}, B, 3) with B one "
+                    f"of {', '.join(str(count) for count in COUNTS[1:])}."
+                )
+            object.__setattr__(self, "harmonics", harmonics)
         object.__setattr__(self, "color", color)
         object.__setattr__(self, "density", density)
 
@@ -84,8 +98,12 @@ class Field:
         location = self.location_on(mesh)
         color, density = self.color.detach(), self.density.detach()
         # Sums and minima carry NaN and infinity along: two fast passes where all is well, the culprit only if not.
-        if bool(torch.isfinite(color.sum() + density.sum()) & (density.amin() >= 0)):
+        directional = color.new_zeros(()) if self.harmonics is None else self.harmonics.detach().sum().to(color)
+        if bool(torch.isfinite(color.sum() + density.sum() + directional) & (density.amin() >= 0)):
             return
+        if self.harmonics is not None:
+            harmonics = self.harmonics.detach().flatten(1)
+            _refuse_first(~torch.isfinite(harmonics).all(1), harmonics, f"harmonics of {location}", "make them finite")
         _refuse_first(~torch.isfinite(color).all(1), color, f"color of {location}", "make every color finite")
         _refuse_first(~torch.isfinite(density), density, f"density of {location}", "make every density finite")
         _refuse_first(density < 0, density, f"density of {location}", "densities must not be negative")
@@ -100,9 +118,29 @@ class Field:
         Returns:
             A field that autograd sees as a function of this one.
         """
-        return Field(
-            self.color.to(device=device, dtype=dtype), self.density.to(device=device, dtype=dtype), self.location
-        )
+        color, density = (tensor.to(device=device, dtype=dtype) for tensor in (self.color, self.density))
+        harmonics = None if self.harmonics is None else self.harmonics.to(device=device, dtype=dtype)
+        return Field(color, density, self.location, harmonics)
+
+    def seen_from(self, mesh: TetMesh, eye: torch.Tensor) -> Field:
+        """The colours that a camera sees, of each vertex or cell along the line from the camera to it.
+
+        Args:
+            mesh: The mesh the field belongs to.
+            eye: (3,) position of the camera; differentiable, as are the mesh's vertices.
+
+        Returns:
+            A field without harmonics; this one if it has none.
+        """
+        if self.harmonics is None:
+            return self
+        places = mesh.vertices
+        if self.location_on(mesh) == "cell":
+            places = places[mesh.tets.long()].mean(1)
+        directions = torch.nn.functional.normalize(places - eye.to(places), dim=1)
+        basis = harmonic_basis(directions, COUNTS.index(self.harmonics.shape[1])).to(self.color.dtype)
+        color = self.color + (basis[:, :, None] * self.harmonics.to(self.color.dtype)).sum(1)
+        return Field(color.clamp(min=0.0), self.density, self.location)
 
 
 def _as_floats(values: Any, what: str) -> torch.Tensor:

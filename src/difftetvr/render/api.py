@@ -118,7 +118,7 @@ def prepare_view(
     """Check a view's inputs and bring them into camera space; arguments and errors are those of :func:`render`."""
     if not 0.0 <= transmittance_threshold < 1.0:
         raise DiffTetError(f"transmittance_threshold is {transmittance_threshold}; it must lie in [0, 1).")
-    content, parts = _content(mesh, field)
+    content, parts = _content(mesh, field, camera)
     for tensor in parts:
         if tensor.device != mesh.vertices.device:
             raise MeshError(
@@ -139,13 +139,16 @@ def prepare_view(
     return PreparedView(task, vertices, parts, unit)
 
 
-def _content(mesh: TetMesh, field: Field | ScalarField) -> tuple[Content, tuple[torch.Tensor, ...]]:
+def _content(mesh: TetMesh, field: Field | ScalarField, camera: Camera) -> tuple[Content, tuple[torch.Tensor, ...]]:
     """What the volume holds, and its tensors as they are."""
     location = field.location_on(mesh)
     if isinstance(field, ScalarField):
         if location == "vertex":
             return "scalar", (field.normalised(), *field.knots(mesh.vertices))
         field = field.as_field()
+    if field.harmonics is not None:
+        field.validate(mesh)
+        field = field.seen_from(mesh, camera.position)
     return location, (field.color, field.density)
 
 

@@ -14,6 +14,7 @@ from difftetvr.capture.capture import Capture
 from difftetvr.fit.evaluation import Evaluation
 from difftetvr.mesh.delaunay_check import is_convex, is_delaunay
 from difftetvr.mesh.field import Field
+from difftetvr.mesh.harmonics import COUNTS
 from difftetvr.mesh.tetmesh import TetMesh
 
 _QUALITY_BINS = 10
@@ -60,6 +61,8 @@ def mesh_tables(name: str, mesh: TetMesh, field: Field | None, flat_cells: int |
     else:
         location = field.location_on(mesh)
         table.add_row("color", f"per {location}, {_range(field.color)}")
+        if field.harmonics is not None:
+            table.add_row("harmonics", f"bands up to {COUNTS.index(field.harmonics.shape[1])}")
         table.add_row("density", f"per {location}, {_range(field.density)} per unit length")
     return [table, _quality_table(mesh)]
 

@@ -7,13 +7,23 @@ Whatever a file holds, reading it gives a valid mesh or a :class:`MeshError`: ev
 compared with its size before anything is allocated.
 """
 
-from difftetvr.mesh.io.loading import FIELD_ARRAYS, Flat, MeshData, load, load_data, load_mesh, load_with_optional_field
+from difftetvr.mesh.io.loading import (
+    FIELD_ARRAYS,
+    HARMONICS,
+    Flat,
+    MeshData,
+    load,
+    load_data,
+    load_mesh,
+    load_with_optional_field,
+)
 from difftetvr.mesh.io.npz import is_mesh_archive
 from difftetvr.mesh.io.saving import GEOMETRY_SUFFIXES, WRITABLE_SUFFIXES, require_writable_format, save
 
 __all__ = [
     "FIELD_ARRAYS",
     "GEOMETRY_SUFFIXES",
+    "HARMONICS",
     "WRITABLE_SUFFIXES",
     "Flat",
     "MeshData",

@@ -20,6 +20,7 @@ from difftetvr.mesh.repair import repair
 from difftetvr.mesh.tetmesh import TetMesh
 
 FIELD_ARRAYS = ("color", "density")
+HARMONICS = "harmonics"
 """Names of the point or cell data that are a mesh's field."""
 
 Flat = Literal["refuse", "drop", "repair"]
@@ -189,7 +190,8 @@ def _load(request: _Request) -> tuple[MeshData, MeshError | None]:
     if location is None:
         return found, None
     try:
-        arrays = [_picked(request.path, stored[location], n, kept[location]) for n in FIELD_ARRAYS]
+        names = (*FIELD_ARRAYS, HARMONICS) if HARMONICS in stored[location] else FIELD_ARRAYS
+        arrays = [_picked(request.path, stored[location], n, kept[location]) for n in names]
         field = _build_field(request, mesh, arrays, "vertex" if location == "vertex" else "cell")
         return replace(found, field=field), None
     except MeshError as error:
@@ -329,17 +331,20 @@ def _picked(path: Path, arrays: dict[str, np.ndarray], name: str, rows: np.ndarr
 
 def _build_field(request: _Request, mesh: TetMesh, arrays: list[np.ndarray], location: Location) -> Field:
     count = mesh.num_vertices if location == "vertex" else mesh.num_cells
-    color, density = arrays
+    color, density, *directional = arrays
     if density.ndim == 2 and density.shape[1] == 1:
         density = density[:, 0]
-    for name, values, shape in (("color", color, (count, 3)), ("density", density, (count,))):
+    shapes = [("color", color, (count, 3)), ("density", density, (count,))]
+    shapes += [(HARMONICS, values, (count, 3 * (values.size // max(1, 3 * count)))) for values in directional]
+    for name, values, shape in shapes:
         if values.shape != shape or values.dtype.kind not in "fiu":
             raise MeshError(
                 f"{request.path}: the data array '{name}' is {values.dtype} of shape {values.shape}; "
                 f"it must be numbers of shape {shape}."
             )
-    field = Field(_floats(color, request.dtype), _floats(density, request.dtype), location=location)
     try:
+        harmonics = _floats(directional[0], request.dtype).reshape(count, -1, 3) if directional else None
+        field = Field(_floats(color, request.dtype), _floats(density, request.dtype), location, harmonics)
         field.validate(mesh)
     except MeshError as error:
         raise MeshError(f"{request.path}: {error}") from error

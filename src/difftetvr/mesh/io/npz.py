@@ -44,7 +44,7 @@ def read(path: Path) -> Content:
     point_data, cell_data = {}, {}
     for name, values in arrays.items():
         rows = len(values) if values.ndim else -1
-        if rows == len(tets) and (rows != len(vertices) or (per_cell and name in ("color", "density"))):
+        if rows == len(tets) and (rows != len(vertices) or (per_cell and name in ("color", "density", "harmonics"))):
             cell_data[name] = values
         elif rows == len(vertices):
             point_data[name] = values

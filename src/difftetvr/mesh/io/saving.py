@@ -12,6 +12,7 @@ from difftetvr.errors import MeshError
 from difftetvr.files import atomic_write
 from difftetvr.mesh.field import Field
 from difftetvr.mesh.io import bintet, npz, ovm, tetgen, through_meshio
+from difftetvr.mesh.io.loading import HARMONICS
 from difftetvr.mesh.tetmesh import TetMesh
 
 GEOMETRY_SUFFIXES = (".mesh",)
@@ -20,13 +21,17 @@ GEOMETRY_SUFFIXES = (".mesh",)
 WRITABLE_SUFFIXES = (".vtu", ".vtk", ".msh", ".xdmf", ".npz", ".bintet", ".ovm", ".node", ".ele")
 """Suffixes of formats that hold a mesh with its field."""
 
+DIRECTIONAL_SUFFIXES = (".vtu", ".npz")
+"""Suffixes of formats that hold spherical harmonics, too: ``harmonics``, 3 components for each function."""
+
 
 def save(path: str | Path, mesh: TetMesh, field: Field | None = None) -> None:
     """Writes a mesh with its field; the suffix chooses the format.
 
     The file appears whole or not at all. ``color`` and ``density`` are point data of a field per vertex and cell data
-    of a field per cell. A .npz holds arrays ``vertices``, ``tets``, ``color``, ``density`` and ``location``; a .node or
-    .ele is written with the other of the pair. A .bintet holds float32 only, and float64 values are rounded.
+    of a field per cell, as are ``harmonics`` where it has them. A .npz holds arrays ``vertices``, ``tets``, ``color``,
+    ``density`` and ``location``; a .node or .ele is written with the other of the pair. A .bintet holds float32 only,
+    and float64 values are rounded.
 
     Args:
         path: .vtu (zlib), .vtk, .msh, .xdmf, .npz, .bintet, .ovm, .node or .ele; .mesh for a mesh without a field.
@@ -43,7 +48,7 @@ def save(path: str | Path, mesh: TetMesh, field: Field | None = None) -> None:
     if suffix == ".bintet":
         mesh = mesh.to(dtype=torch.float32)
     location = "vertex" if field is None else field.location_on(mesh)
-    arrays = {} if field is None else {"color": _array(field.color), "density": _array(field.density)}
+    arrays = _arrays(path, field)
     vertices, tets = _array(mesh.vertices), _array(mesh.tets)
     with atomic_write(path, MeshError) as temporary:
         if suffix == ".npz":
@@ -82,6 +87,21 @@ def require_writable_format(path: Path, with_field: bool = True) -> None:
             f"{path}: '{path.suffix}' is no format that holds tetrahedra with colour and density; "
             f"use one of {', '.join(WRITABLE_SUFFIXES)}."
         )
+
+
+def _arrays(path: Path, field: Field | None) -> dict[str, np.ndarray]:
+    """The field's arrays by name."""
+    if field is None:
+        return {}
+    arrays = {"color": _array(field.color), "density": _array(field.density)}
+    if field.harmonics is not None:
+        if path.suffix.lower() not in DIRECTIONAL_SUFFIXES:
+            raise MeshError(
+                f"{path}: '{path.suffix}' holds no colours that depend on the direction (spherical harmonics); use "
+                f"{' or '.join(DIRECTIONAL_SUFFIXES)}, or save a field without harmonics."
+            )
+        arrays[HARMONICS] = _array(field.harmonics.flatten(1))
+    return arrays
 
 
 def _write_xdmf(path: Path, *content: Any) -> None:
