@@ -66,7 +66,8 @@ def test_seed_decides_views_and_backgrounds():
 def test_given_backgrounds():
     assert FitConfig(background="white").background_at(5) == (1.0, 1.0, 1.0)
     assert FitConfig(background=(0.1, 0.2, 0.3)).evaluation_background() == (0.1, 0.2, 0.3)
-    assert FitConfig(background="random").evaluation_background() == (0.0, 0.0, 0.0)
+    assert FitConfig(background="random").evaluation_background() == (1.0, 1.0, 1.0)
+    assert FitConfig().evaluation_background() == (0.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from difftetvr.cli.options import CaptureOptions, Output, parse
-from difftetvr.fit.config import FitConfig
+from difftetvr.fit.config import CHOSEN_FOR_CAPTURE, FitConfig
 from difftetvr.fit.errors import FitError
 from difftetvr.fit.folder import RunFolder
 from difftetvr.fit.options import options_from_json
@@ -28,7 +28,8 @@ class Fit:
     """Reconstruct a tetrahedral volume from images."""
 
     capture: Annotated[str, Positional, arg(metavar="CAPTURE")]
-    """What to fit: tooth (the built-in CT scan), or the path of a volume or of a saved capture (.npz)."""
+    """What to fit: tooth (the built-in CT scan), or the path of a volume, of photographs with their cameras (NeRF-synthetic,
+    transforms.json, COLMAP, cameras.json), or of a saved capture (.npz)."""
     output: Output
     """Folder for the model, its metrics, pictures and checkpoint."""
     config: Annotated[FitConfig, arg(name="")] = field(default_factory=FitConfig)
@@ -48,10 +49,12 @@ class Fit:
         folder.require_free(resume=self.resume, overwrite=self.overwrite)
         capture = self.views_of.load(self.capture, console)
         trainer = prepare(capture, self.config, resume_from=folder.checkpoint if self.resume else None)
+        _print_choices(console, self.config, trainer.config)
         if self.config.initial_mesh is not None:
             _print_start(console, self.config.initial_mesh, trainer)
         # Only now: what cannot even start neither leaves a folder behind nor costs the run that is to be replaced.
-        options = self.to_json() | ({"repair": trainer.repair} if trainer.repair else {})
+        chosen = dataclasses.replace(self, config=trainer.config)
+        options = chosen.to_json() | ({"repair": trainer.repair} if trainer.repair else {})
         with folder.occupied(options, overwrite=self.overwrite, begun=lambda: trainer.iteration > 0):
             result = self._optimise(trainer, folder, console)
         write_report(folder, result, capture)
@@ -93,6 +96,14 @@ class Fit:
         if saved["views_of"] != self.views_of:
             raise FitError(f"The run in {self.output} has other views; resume with the same options for them.")
         saved["config"].require_same_run(self.config)
+
+
+def _print_choices(console: Console, given: FitConfig, chosen: FitConfig) -> None:
+    """Says what was chosen for the images where the options left it open."""
+    open_options = [item.name for item in dataclasses.fields(given) if item.name in CHOSEN_FOR_CAPTURE]
+    choices = [f"--{name} {getattr(chosen, name)}" for name in open_options if getattr(given, name) is None]
+    if choices:
+        console.print(f"Chosen for these images: {', '.join(choices)}", highlight=False)
 
 
 def _print_start(console: Console, path: str, trainer: Trainer) -> None:

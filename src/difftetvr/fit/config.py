@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -15,6 +15,10 @@ from difftetvr.fit.options import LARGEST_COUNT, options_from_json, require
 from difftetvr.fit.positions import VertexOptimizerConfig
 from difftetvr.fit.refinement import Exchange, Grow, Star, Strategy
 from difftetvr.mesh.faces import MAX_CELLS
+from difftetvr.mesh.harmonics import MAX_DEGREE
+
+if TYPE_CHECKING:
+    from difftetvr.capture.capture import Capture
 
 Background = Literal["black", "white", "random"] | tuple[float, float, float]
 
@@ -30,7 +34,14 @@ _RANGES = {
     "evaluate_every": (0, LARGEST_COUNT),
     "seed": (0, LARGEST_COUNT),
 }
+_LOSSES = ("l2", "l1", "l1-ssim")
+_BACKGROUNDS = ("black", "white", "random")
+_PHOTO_BANDS = 2
+_BAND_SHARE = 0.05  # of the run, from one band of harmonics to the next
 _STRATEGIES = ("exchange", "grow", "star", "none")
+CHOSEN_FOR_CAPTURE = ("background", "harmonics")
+"""Options whose default depends on the images."""
+
 # Options that change nothing about where the optimisation goes: a resumed run may choose them anew.
 _FREE_OPTIONS = frozenset({"device", "evaluate_every", "checkpoint_seconds"})
 
@@ -83,18 +94,26 @@ class FitConfig:
     """Number of optimisation steps."""
     batch_views: int = 1
     """Training views per step; their gradients are averaged."""
-    loss: Literal["l2", "l1"] = "l2"
-    """Mean squared (l2) or mean absolute (l1) difference of the images."""
+    loss: Literal["l2", "l1", "l1-ssim"] = "l2"
+    """Mean squared (l2) or mean absolute (l1) difference of the images; l1-ssim has a fifth of 1 - SSIM in it."""
+    harmonics: int | None = None
+    """Bands of spherical harmonics, from 0 to 3, by which colours depend on the direction; default: 2 for photographs,
+    else 0."""
+    harmonics_rate: float = 0.5
+    """Learning rate of their coefficients, in units of that of colours."""
     rate: float = 0.03
     """Learning rate of the first step."""
     final_rate: float = 0.001
     """Learning rate of the last step; in between it falls log-linearly."""
     betas: tuple[float, float] = (0.9, 0.99)
     """Decay of Adam's first and second moments."""
-    background: Background = "black"
-    """Behind the volume: black, white, random in every step, or linear R G B. All but black need images with alpha."""
+    background: Background | None = None
+    """Behind the volume: black, white, random in every step (white where images are compared), or R G B. All but black
+    need images with alpha. Default: random for photographs with alpha, else black."""
     haze_penalty: float = 0.01
     """Pull towards zero density, in mean absolute density gradients; removes fog that no training view can refute."""
+    sparsity: float = 0.0
+    """Weight of a loss that favours few opaque places over much fog: the mean over vertices of log(1 + 2 density^2)."""
     initial_color: float = 0.5
     """Colour that all vertices start with, in [0, 1]."""
     initial_density: float = 0.05
@@ -123,15 +142,17 @@ class FitConfig:
         for name, (least, most) in _RANGES.items():
             value = getattr(self, name)
             require(least <= value <= most, name, value, f"at least {least} and at most {most}")
-        for name in ("rate", "final_rate"):
+        for name in ("rate", "final_rate", "harmonics_rate"):
             require(_positive(getattr(self, name)), name, getattr(self, name), "greater than 0 and finite")
-        for name in ("haze_penalty", "initial_density", "checkpoint_seconds"):
+        for name in ("haze_penalty", "sparsity", "initial_density", "checkpoint_seconds"):
             value = getattr(self, name)
             require(value >= 0 and math.isfinite(value), name, value, "at least 0 and finite")
         require(0 <= self.initial_color <= 1, "initial_color", self.initial_color, "between 0 and 1")
         require(all(0 <= b < 1 for b in self.betas), "betas", self.betas, "at least 0 and less than 1")
         require(self.location in ("vertex", "cell"), "location", self.location, "vertex or cell")
-        require(self.loss in ("l1", "l2"), "loss", self.loss, "l1 or l2")
+        require(self.loss in _LOSSES, "loss", self.loss, f"one of {', '.join(_LOSSES)}")
+        bands = self.harmonics
+        require(bands is None or 0 <= bands <= MAX_DEGREE, "harmonics", bands, f"between 0 and {MAX_DEGREE}")
         require(self.refine in _STRATEGIES, "refine", self.refine, f"one of {', '.join(_STRATEGIES)}")
         on_cells = self.location == "cell" and self.refine != "none"
         require(not on_cells, "refine", self.refine, "none where colours belong to cells (location cell)")
@@ -141,14 +162,32 @@ class FitConfig:
             require(fits, "grid", self.grid, f"at most {MAX_CELLS // _CELLS_PER_CUBE} cubes in all")
         require(self.initial_mesh is None or self.grid is None, "grid", self.grid, "left out with an initial mesh")
         require(self.initial_mesh is not None or not self.repair, "repair", self.repair, "given with an initial mesh")
-        named = isinstance(self.background, str)
-        valid = self.background in ("black", "white", "random") if named else _is_color(self.background)
+        named = self.background is None or isinstance(self.background, str)
+        valid = self.background in (None, *_BACKGROUNDS) if named else _is_color(self.background)
         require(valid, "background", self.background, "black, white, random or three values in [0, 1]")
 
     @property
     def needs_alpha(self) -> bool:
         """Whether training images must be composited over something that is not black."""
-        return self.background not in ("black", (0.0, 0.0, 0.0))
+        return self.background not in (None, "black", (0.0, 0.0, 0.0))
+
+    def for_capture(self, capture: Capture) -> FitConfig:
+        """These options with those that are left open chosen as suits the images.
+
+        Args:
+            capture: Images and cameras.
+        """
+        is_photo = capture.encoding == "srgb"
+        background: Background = "random" if is_photo and capture.alphas is not None else "black"
+        return dataclasses.replace(
+            self,
+            background=background if self.background is None else self.background,
+            harmonics=(_PHOTO_BANDS if is_photo else 0) if self.harmonics is None else self.harmonics,
+        )
+
+    def bands_at(self, iteration: int) -> int:
+        """Bands of the harmonics that take part in a step: they are switched on one after the other."""
+        return min(self.harmonics or 0, int(iteration / (_BAND_SHARE * self.iterations)))
 
     def strategy(self) -> Strategy | None:
         """How the mesh is refined; None if it is not."""
@@ -192,9 +231,9 @@ class FitConfig:
         return float(r), float(g), float(b)
 
     def evaluation_background(self) -> tuple[float, float, float]:
-        """Background of held-out images: the given one, black where training uses random ones."""
-        if isinstance(self.background, str):
-            return _BACKGROUND_COLORS.get(self.background, _BACKGROUND_COLORS["black"])
+        """Background of held-out images: the given one, white where training uses random ones."""
+        if self.background is None or isinstance(self.background, str):
+            return _BACKGROUND_COLORS["black" if self.background in (None, "black") else "white"]
         return self.background
 
     def require_same_run(self, other: FitConfig) -> None:

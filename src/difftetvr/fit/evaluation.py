@@ -71,6 +71,13 @@ def true_image(capture: Capture, view: int, background: Color = BLACK) -> torch.
     return image + (1.0 - capture.alphas[view])[..., None] * torch.tensor(background)
 
 
+def where_valid(capture: Capture, view: int, image: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
+    """An image of a view with the truth in the pixels that the capture's mask leaves out."""
+    if capture.valid is None:
+        return image
+    return torch.where(capture.valid[view].to(image.device)[..., None], image, truth)
+
+
 @torch.no_grad()
 def rendered_image(mesh: TetMesh, field: Field, capture: Capture, view: int, background: Color = BLACK) -> torch.Tensor:
     """(H, W, 3) image of the reconstruction from the camera of a view, on the CPU."""
@@ -93,8 +100,9 @@ def evaluate(
     psnrs, ssims = [], []
     for view in views:
         truth = true_image(capture, view, background)
-        image = rendered_image(mesh, field, capture, view, background)
-        psnrs.append(psnr(image, truth))
+        image = where_valid(capture, view, rendered_image(mesh, field, capture, view, background), truth)
+        share = 1.0 if capture.valid is None else float(capture.valid[view].float().mean())
+        psnrs.append(psnr(image, truth, share))
         if min(truth.shape[:2]) >= SSIM_WINDOW:
             ssims.append(ssim(image, truth))
     return Evaluation(list(views), psnrs, ssims)

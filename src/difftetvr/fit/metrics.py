@@ -18,18 +18,19 @@ def psnr_of_mse(mse: float) -> float:
     return float(-10.0 * torch.log10(torch.tensor(max(mse, _LEAST_MSE), dtype=torch.float64)))
 
 
-def psnr(image: torch.Tensor, reference: torch.Tensor) -> float:
+def psnr(image: torch.Tensor, reference: torch.Tensor, share: float = 1.0) -> float:
     """Peak signal-to-noise ratio in dB for a peak of 1, of images clipped to [0, 1] first.
 
     Args:
-        image: (H, W, 3) image, linear.
+        image: (H, W, 3) image.
         reference: Image of the same shape.
+        share: Part of the pixels that count, in (0, 1]; the images are the same in the others.
 
     Raises:
         CaptureError: The shapes differ.
     """
     a, b = _comparable(image, reference)
-    return psnr_of_mse(float((a - b).square().mean()))
+    return psnr_of_mse(float((a - b).square().mean()) / max(share, 1e-9))
 
 
 def ssim(image: torch.Tensor, reference: torch.Tensor) -> float:
@@ -51,7 +52,17 @@ def ssim(image: torch.Tensor, reference: torch.Tensor) -> float:
             f"SSIM needs images of at least {SSIM_WINDOW} x {SSIM_WINDOW} pixels, these are "
             f"{a.shape[1]} x {a.shape[0]}; render larger images."
         )
-    a, b = a.movedim(-1, 0), b.movedim(-1, 0)
+    return float(mean_similarity(a, b))
+
+
+def mean_similarity(image: torch.Tensor, reference: torch.Tensor) -> torch.Tensor:
+    """The scalar of :func:`ssim` for images as they are: neither clipped nor converted, and differentiable.
+
+    Args:
+        image: (H, W, 3), at least 11 x 11 pixels.
+        reference: Image of the same shape.
+    """
+    a, b = image.movedim(-1, 0), reference.movedim(-1, 0)
     window = _gaussian(a)
     mean_a, mean_b = _blur(a, window), _blur(b, window)
     variance_a = _blur(a * a, window) - mean_a**2
@@ -60,7 +71,7 @@ def ssim(image: torch.Tensor, reference: torch.Tensor) -> float:
     c1, c2 = _SSIM_K1**2, _SSIM_K2**2
     luminance = (2 * mean_a * mean_b + c1) / (mean_a**2 + mean_b**2 + c1)
     structure = (2 * covariance + c2) / (variance_a + variance_b + c2)
-    return float((luminance * structure).mean())
+    return (luminance * structure).mean()
 
 
 def _comparable(image: torch.Tensor, reference: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -75,7 +86,7 @@ def _comparable(image: torch.Tensor, reference: torch.Tensor) -> tuple[torch.Ten
 
 
 def _gaussian(like: torch.Tensor) -> torch.Tensor:
-    x = torch.arange(SSIM_WINDOW, dtype=like.dtype) - SSIM_WINDOW // 2
+    x = torch.arange(SSIM_WINDOW, dtype=like.dtype, device=like.device) - SSIM_WINDOW // 2
     weights = torch.exp(-0.5 * (x / _SSIM_SIGMA) ** 2)
     return weights / weights.sum()
 

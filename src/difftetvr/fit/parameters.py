@@ -9,16 +9,16 @@ import torch
 from difftetvr.fit.config import FitConfig
 from difftetvr.mesh.change import MeshChange
 from difftetvr.mesh.field import Field
+from difftetvr.mesh.harmonics import COUNTS
 from difftetvr.mesh.tetmesh import TetMesh
 
-_NAMES = ("color", "density")
 _FIRST, _SECOND = "exp_avg", "exp_avg_sq"  # Adam's names of its moments
 # Gradients of a mean over pixels shrink as cells and pixels do; Adam's usual 1e-8 would drown those of fine meshes.
 _EPSILON = 1e-15
 
 
 class FieldParameters:
-    """Colours and densities on a mesh, with their Adam optimiser.
+    """Colours and densities on a mesh, directional colours too if wanted, with their Adam optimiser.
 
     Density is stored in units of the capture's typical density, so that one learning rate fits scenes of any size.
     After each step the parameters are projected to the valid ranges, colours to [0, 1] and densities to [0, inf):
@@ -27,6 +27,7 @@ class FieldParameters:
     Attributes:
         color: (N, 3) leaf tensor, linear RGB; N vertices or cells.
         density: (N,) leaf tensor in units of ``density_unit``.
+        harmonics: (N, B, 3) leaf tensor, coefficients of the directional part of the colours; None without it.
         density_unit: Density per unit length that a parameter of 1 stands for.
         location: ``"vertex"`` or ``"cell"``, what the N entries belong to.
     """
@@ -36,7 +37,7 @@ class FieldParameters:
 
         Args:
             mesh: What they are values on.
-            config: Options.
+            config: Options, chosen for the capture.
             density_unit: Density per unit length that a parameter of 1 stands for.
             initial: Field to begin with, at the location of the options; default: the options' initial values.
         """
@@ -49,12 +50,18 @@ class FieldParameters:
         if initial is not None:
             color.copy_(initial.color.detach())
             density.copy_(initial.density.detach().double() / density_unit)
+        bands = COUNTS[config.harmonics or 0]
+        harmonics = torch.zeros(count, bands, 3, device=device) if bands else None
+        if harmonics is not None and initial is not None and initial.harmonics is not None:
+            shared = min(bands, initial.harmonics.shape[1])
+            harmonics[:, :shared] = initial.harmonics.detach()[:, :shared]
         self.color, self.density = color.requires_grad_(), density.requires_grad_()
-        self._optimizer = torch.optim.Adam(
-            [self.color, self.density], lr=config.rate, betas=config.betas, eps=_EPSILON, fused=True
-        )
+        self.harmonics = None if harmonics is None else harmonics.requires_grad_()
+        self._shares = [1.0, config.harmonics_rate]
+        groups = [{"params": group} for group in self._groups() if group]
+        self._optimizer = torch.optim.Adam(groups, lr=config.rate, betas=config.betas, eps=_EPSILON, fused=True)
         # Adam would make its state in the first step; made here, a checkpoint holds the same arrays from the start.
-        for parameter in (self.color, self.density):
+        for _, parameter in self._items():
             zeros = torch.zeros_like(parameter, requires_grad=False)
             self._optimizer.state[parameter] = {
                 "step": torch.zeros((), device=device),
@@ -62,14 +69,20 @@ class FieldParameters:
                 _SECOND: zeros.clone(),
             }
 
-    def field(self) -> Field:
-        """The field that the parameters stand for, differentiable in them."""
-        return Field(self.color, self.density_unit * self.density, location=self.location)
+    def field(self, bands: int) -> Field:
+        """The field that the parameters stand for, differentiable in them.
+
+        Args:
+            bands: Bands of the harmonics that take part.
+        """
+        harmonics = self.harmonics[:, : COUNTS[bands]] if self.harmonics is not None and bands else None
+        return Field(self.color, self.density_unit * self.density, self.location, harmonics)
 
     def detached_field(self) -> Field:
         """A copy of the field as it is now, without gradients."""
         color, density = self.color.detach().clone(), self.density_unit * self.density.detach()
-        return Field(color, density, location=self.location)
+        harmonics = None if self.harmonics is None else self.harmonics.detach().clone()
+        return Field(color, density, self.location, harmonics)
 
     def values(self) -> torch.Tensor:
         """(N, 4) copy of all parameters: linear RGB, and density in units of ``density_unit``."""
@@ -93,7 +106,8 @@ class FieldParameters:
             carried = change.carry(parameter.detach()).requires_grad_()
             self._optimizer.state[carried] = state
             setattr(self, name, carried)
-        self._optimizer.param_groups[0]["params"] = [parameter for _, parameter in self._items()]
+        for group, parameters in zip(self._optimizer.param_groups, self._groups()):
+            group["params"] = parameters
 
     def add(self, surplus: torch.Tensor) -> None:
         """Changes the values, and projects them to the valid ranges.
@@ -118,8 +132,8 @@ class FieldParameters:
             haze_penalty: This many mean absolute density gradients are added to every density gradient. Where images
                 say something they drown it; fog that no image can tell from the background decays.
         """
-        for group in self._optimizer.param_groups:
-            group["lr"] = rate
+        for group, share in zip(self._optimizer.param_groups, self._shares):
+            group["lr"] = share * rate
         if haze_penalty and self.density.grad is not None:
             self.density.grad += haze_penalty * self.density.grad.abs().mean()
         self._optimizer.step()
@@ -148,5 +162,12 @@ class FieldParameters:
             self.color.clamp_(0.0, 1.0)
             self.density.clamp_(min=0.0)
 
+    def _groups(self) -> list[list[torch.Tensor]]:
+        """Parameters that share a learning rate."""
+        return [[self.color, self.density], [] if self.harmonics is None else [self.harmonics]]
+
     def _items(self) -> Iterator[tuple[str, torch.Tensor]]:
-        return ((name, getattr(self, name)) for name in _NAMES)
+        yield "color", self.color
+        yield "density", self.density
+        if self.harmonics is not None:
+            yield "harmonics", self.harmonics

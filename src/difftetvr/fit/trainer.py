@@ -16,10 +16,10 @@ from difftetvr.errors import CaptureError
 from difftetvr.fit.checkpoint import Checkpoint, describe_capture, require_same_capture
 from difftetvr.fit.config import FitConfig, grid_cubes
 from difftetvr.fit.errors import FitError
-from difftetvr.fit.evaluation import evaluate, rendered_image, true_image
+from difftetvr.fit.evaluation import evaluate, rendered_image, true_image, where_valid
 from difftetvr.fit.history import History, MoveTotals, RefinementRecord
 from difftetvr.fit.initial import Start, load_start
-from difftetvr.fit.losses import LOSSES
+from difftetvr.fit.losses import LOSSES, sparsity
 from difftetvr.fit.metrics import psnr_of_mse
 from difftetvr.fit.parameters import FieldParameters
 from difftetvr.fit.positions import StepReport, VertexOptimizer
@@ -42,7 +42,7 @@ class Trainer:
 
     Attributes:
         capture: Images and cameras.
-        config: Options.
+        config: Options, those that were left open chosen for the capture.
         strategy: How the mesh is refined; None: not at all.
         budget: Cells that the mesh may have.
         parameters: Colours and densities under optimisation.
@@ -70,6 +70,7 @@ class Trainer:
                 the initial mesh does not suit the options or the images.
             MeshError: The file of the initial mesh cannot be read or holds an invalid mesh, or the grid is too large.
         """
+        config = config.for_capture(capture)
         strategy = strategy or config.strategy()
         require_fittable(capture, config, strategy)
         self.capture = capture
@@ -157,7 +158,7 @@ class Trainer:
         Raises:
             FitError: The checkpoint is of a run with other options or images, or lacks something.
         """
-        checkpoint.config.require_same_run(config)
+        checkpoint.config.require_same_run(config.for_capture(capture))
         trainer = Trainer(capture, config, checkpoint.mesh(), strategy)
         require_same_capture(checkpoint.capture, trainer._capture_description)
         checkpoint.require_strategy(type(trainer.strategy).__name__)
@@ -267,6 +268,7 @@ class Trainer:
                 true_image(self.capture, view, background),
                 background,
                 deterministic=deterministic,
+                valid=None if self.capture.valid is None else self.capture.valid[view],
             )
             for view in views
         )
@@ -278,8 +280,9 @@ class Trainer:
         background = self.config.background_at(self.iteration)
         errors = []
         for view in views:
+            truth = true_image(self.capture, view, background)
             image = rendered_image(self.mesh, field, self.capture, view, background)
-            errors.append(float((image - true_image(self.capture, view, background)).square().mean()))
+            errors.append(float((where_valid(self.capture, view, image, truth) - truth).square().mean()))
         return sum(errors) / len(errors)
 
     def _color_gradients(self) -> torch.Tensor:
@@ -302,12 +305,15 @@ class Trainer:
         truth = true_image(self.capture, view, background).to(device)
         image = render(
             mesh,
-            self.parameters.field(),
+            self.parameters.field(self.config.bands_at(self.iteration)),
             self.capture.cameras[view],
             background=torch.tensor(background, device=device),
             deterministic=self.config.deterministic,
         ).color
+        image = where_valid(self.capture, view, image, truth)
         loss = LOSSES[self.config.loss](image, truth)
+        if self.config.sparsity:
+            loss = loss + self.config.sparsity * sparsity(self.parameters.density)
         (weight * loss).backward()
         return float(loss.detach()), float((image.detach() - truth).square().mean())
 

@@ -147,6 +147,7 @@ def model_image(
     background: torch.Tensor | tuple[float, float, float] | None = None,
     transmittance_threshold: float = 1e-4,
     deterministic: bool = False,
+    valid: torch.Tensor | None = None,
 ) -> ImageModel:
     """Renders a view, and predicts what changes of the mesh would do to its squared error.
 
@@ -161,6 +162,7 @@ def model_image(
         background: (3,) linear RGB behind the volume; black if None.
         transmittance_threshold: Rays stop once their transmittance is at or below this value.
         deterministic: Whether sums are the same in every run to the last bit, see :func:`difftetvr.render.render`.
+        valid: (H, W) bool, pixels that have an error; None: all. The curvature counts all of them.
 
     Returns:
         The model, in the precision and on the device of the mesh.
@@ -184,6 +186,8 @@ def model_image(
         light, distance = render_forward(tracer)
         image = compose(backend.tensor(light, *size, 4), backend.tensor(distance, *size), behind).color
         residual = image - truth.to(image)
+        if valid is not None:
+            residual = residual * valid.to(residual.device)[..., None]
         curvature = 2.0 / residual.numel()
         records = hat_records(tracer, mesh, HatImage(backend.floats(image), backend.floats(curvature * residual)))
         counts = (mesh.num_vertices, mesh.topology.edges.shape[0], mesh.topology.faces.shape[0])
