@@ -1,5 +1,7 @@
 """`render`: scalars through transfer functions, clip planes, the three renderers, statistics."""
 
+import warnings
+
 import numpy as np
 import pytest
 from commands.helpers import fails
@@ -74,6 +76,28 @@ def test_statistics(simulation, tmp_path, capsys, show, found):
     assert len(np.unique(picture[:20, :24].reshape(-1, 3), axis=0)) > 1
 
 
+def test_statistics_of_a_clipped_mesh(simulation, tmp_path):
+    """A plane that nothing is in front of leaves nothing to count."""
+    given = ["-o", tmp_path / "a.png", "--show", "depth-complexity", *SMALL]
+    whole = render(simulation, *given)[:20, :24]
+    clipped = render(simulation, "--clip", 1, 0, 0, -10, *given)[:20, :24]
+    assert len(np.unique(whole.reshape(-1, 3), axis=0)) > len(np.unique(clipped.reshape(-1, 3), axis=0)) == 1
+
+
+def test_an_uncertain_order_is_one_sentence(tmp_path, capsys):
+    """Without the Python file and line that would issue the warning."""
+    mesh = dtv.TetMesh.grid((3, 3, 3))
+    middle = ((mesh.vertices[mesh.tets.long()].mean(1) - 0.5).abs() < 0.17).all(1)
+    path = tmp_path / "hollow.npz"
+    np.savez(path, vertices=mesh.vertices.numpy(), tets=mesh.tets[~middle].numpy(), heat=np.arange(mesh.num_vertices))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        render(path, "-o", tmp_path / "a.png", "--renderer", "projected", *SMALL)
+    printed = capsys.readouterr()
+    assert "no certain front-to-back order" in printed.out
+    assert "autograd" not in printed.out + printed.err
+
+
 def test_bad_scalars(simulation, tmp_path, capsys):
     given = ["-o", tmp_path / "a.png", *SMALL]
     assert "pressure, velocity" in fails(capsys, "render", simulation, *given)
@@ -81,7 +105,9 @@ def test_bad_scalars(simulation, tmp_path, capsys):
         capsys, "render", simulation, "--scalar", "heat", *given
     )
     assert "range" in fails(capsys, "render", simulation, "--scalar", "pressure", "--value-range", 1, 0, *given)
-    assert "attenuation" in fails(capsys, "render", simulation, "--scalar", "pressure", "--attenuation", -1, *given)
+    assert "--attenuation is -1" in fails(
+        capsys, "render", simulation, "--scalar", "pressure", "--attenuation", -1, *given
+    )
     missing = tmp_path / "none.json"
     assert "none.json" in fails(
         capsys, "render", simulation, "--scalar", "pressure", "--transfer-function", missing, *given
@@ -105,7 +131,7 @@ def test_real_meshes(shared_data, tmp_path, capsys):
     assert render(meshes / "post.vtk", "-o", tmp_path / "a.png", *SMALL).max() > 0.1
     assert render(meshes / "bluntfin.npz", "--scalar", "density", "-o", tmp_path / "b.png", *SMALL).max() > 0.02
     assert "77 of 187,395 cells have no volume" in capsys.readouterr().out
-    assert "split" in fails(capsys, "render", meshes / "hexa.vtk", "-o", tmp_path / "c.png")
+    assert "--split" in fails(capsys, "render", meshes / "hexa.vtk", "-o", tmp_path / "c.png")
     assert render(meshes / "hexa.vtk", "--split", "-o", tmp_path / "c.png", *SMALL).max() > 0.1
 
 

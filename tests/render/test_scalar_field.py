@@ -110,6 +110,32 @@ def test_a_jump_is_a_surface() -> None:
     assert torch.allclose(image.optical_depth / 3.0, torch.full_like(image.optical_depth, 0.5), rtol=3e-3)
 
 
+@pytest.mark.parametrize("renderer", RENDERERS)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_region_whose_scalar_is_at_a_jump(dtype: torch.dtype, renderer: str) -> None:
+    """Rounding must not carry the scalar across the jump: at it, the later knot counts."""
+    scene = SCENES["delaunay"]()
+    mesh = mesh_of(scene, dtype)
+    opacity, color = torch.tensor([0.0, 0.0, 0.5, 0.5]), torch.tensor([0.0, 0.0, 1.0, 1.0])[:, None].expand(4, 3)
+    function = TransferFunction(torch.tensor([0.0, 0.4, 0.4, 1.0], dtype=dtype), opacity, color)
+    constant = torch.full((mesh.num_vertices,), 0.4, dtype=dtype)
+    image = render(mesh, ScalarField(constant, function, 2.0, (0.0, 1.0)), scene.camera, renderer=renderer)
+    field = Field(torch.ones(mesh.num_vertices, 3, dtype=dtype), torch.ones(mesh.num_vertices, dtype=dtype))
+    assert torch.allclose(image.color, render(mesh, field, scene.camera).color, atol=1e-5)
+
+
+def test_knots_that_change_before_the_backward_pass() -> None:
+    """Gradients are those of the image that was seen."""
+    scene = SCENES["delaunay"]()
+    mesh = mesh_of(scene)
+    function = transfer_function(requires_grad=True)
+    loss = render(mesh, ScalarField(scalars_of(mesh), function, 2.0), scene.camera).color.sum()
+    (before,) = torch.autograd.grad(loss, function.scalar, retain_graph=True)
+    with torch.no_grad():
+        function.scalar.add_(0.01)
+    assert torch.equal(torch.autograd.grad(loss, function.scalar)[0], before)
+
+
 @pytest.mark.parametrize("clip", [None, (0.3, -0.5, 0.8, 0.05)])
 @pytest.mark.parametrize("renderer", RENDERERS)
 @pytest.mark.parametrize("name", ["delaunay", "inside"])

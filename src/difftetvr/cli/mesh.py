@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from difftetvr.mesh.tetmesh import TetMesh
 
 _GRID_CELLS = 20_000
-# Format name and options of meshio by suffix.
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -46,6 +47,8 @@ class ScalarOptions:
         from difftetvr.optics.transfer_function import TransferFunction
         from difftetvr.render import ScalarField
 
+        if not (math.isfinite(self.attenuation) and self.attenuation >= 0):
+            raise MeshError(f"--attenuation is {self.attenuation:g}; it must be finite and not negative.")
         name, values, location = self._find(data, path)
         low, high = (float(v) for v in torch.aminmax(values))
         if low == high and self.value_range is None:
@@ -115,6 +118,7 @@ class Render:
     def run(self, console: Console) -> None:
         """Renders and writes the picture."""
         from difftetvr.fit.trainer import resolve_device
+        from difftetvr.render import OrderWarning
         from difftetvr.view.pictures import require_png
 
         require_png(self.output)
@@ -123,10 +127,14 @@ class Render:
         data = self.mesh.load(self.model, console)
         device = resolve_device(self.device)
         mesh = data.mesh.to(device=device)
-        if self.show == "image":
-            self._draw_image(data, mesh, console)
-        else:
-            self._draw_statistics(mesh, console)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", OrderWarning)
+            if self.show == "image":
+                self._draw_image(data, mesh, console)
+            else:
+                self._draw_statistics(mesh, console)
+        for warning in caught:
+            console.print(str(warning.message), highlight=False)
 
     def _draw_image(self, data: MeshData, mesh: TetMesh, console: Console) -> None:
         from difftetvr.render import render
@@ -150,7 +158,7 @@ class Render:
         from difftetvr.render.inspection import inspect_rays
         from difftetvr.view.heatmap import Scale, save_heatmap
 
-        statistics = inspect_rays(mesh, self._camera(mesh), self.renderer)
+        statistics = inspect_rays(mesh, self._camera(mesh), self.renderer, self.clip)
         if self.show == "depth-complexity":
             values = statistics.depth_complexity.float()
             most, mean = int(values.max()), float(values.mean())

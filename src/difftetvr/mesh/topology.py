@@ -142,8 +142,8 @@ class Topology:
         if not self.is_conforming:
             raise MeshError(
                 "This mesh is made of loose cells (conforming=False), which have no neighbours: only "
-                "renderer='projected' and what looks at cells one by one work with it; build it with conforming=True "
-                "if its cells meet face to face."
+                "renderer='linked-list', renderer='projected' and what looks at cells one by one work with it; build "
+                "it with conforming=True if its cells meet face to face."
             )
         matching = match_faces(self.tets, self.num_vertices)
         check_matching(matching, self.tets)

@@ -181,9 +181,12 @@ class _AdjointKernel:
 
     def visit(self, step: Step, ray: AdjointRay) -> AdjointRay:
         start, end = step.entry, step.leaving
+        if self.view.transfer is not None:
+            start = self.view.transfer.bounded(start, step.face)
+            end = self.view.transfer.bounded(end, step.next_face)
         clip = None if self.span is None else self.span.clip(start[0], end[0])
         if clip:
-            start, end = clip.start(step.entry, step.leaving), clip.end(step.entry, step.leaving)
+            start, end = clip.start(start, end), clip.end(start, end)
         if self.view.cells is not None:
             record = dr.gather(self.view.backend.Float4, self.view.cells, step.cell)
             constant = [record[3], self._radiance([record[0], record[1], record[2]])]

@@ -69,7 +69,7 @@ def start_rows(scene: EntryScene, mesh: TetMesh, around: torch.Tensor, begin: in
     none = scene.no_row
     neighbors = backend.uints(mesh.topology.cell_adjacency[around.long()].T)
 
-    def body(row: Any, best: Any, farthest: Any, ahead: Any) -> tuple[Any, Any, Any, Any]:
+    def body(row: Any, best: Any, farthest: Any, ahead: Any, rounding: Any) -> tuple[Any, ...]:
         face = scene.face(frame, row)
         apex = scene.corner(frame, dr.gather(uint, scene.apices, row))
         depth, exit_depth = crossing_depth(face), crossing_depth(find_exit(face, apex).face(face, apex))
@@ -81,6 +81,7 @@ def start_rows(scene: EntryScene, mesh: TetMesh, around: torch.Tensor, begin: in
             dr.select(spans, row, best),
             dr.select(spans, exit_depth, farthest),
             dr.select(enters, dr.fmin(ahead, depth), ahead),
+            dr.fmax(rounding, _rounding(face)),
         )
 
     lanes = dr.width(pixel)
@@ -90,10 +91,20 @@ def start_rows(scene: EntryScene, mesh: TetMesh, around: torch.Tensor, begin: in
         none + dr.zeros(uint, lanes),
         dr.zeros(real, lanes),
         dr.full(real, dr.inf, lanes),
+        dr.zeros(real, lanes),
     )
-    _, best, farthest, ahead = dr.while_loop(state, lambda row, *_: row < none, body)
+    _, best, farthest, ahead, rounding = dr.while_loop(state, lambda row, *_: row < none, body)
     # Depths within rounding of the camera need not grow along a ray. Where it enters through a boundary face ahead and
-    # before the end of the cell found here, both belong to one path, and it starts at that face.
-    best = dr.select(ahead < farthest, none, best)
+    # before the end of the cell found here, or within rounding, both belong to one path, and it starts at that face.
+    best = dr.select((ahead < farthest) | (ahead <= rounding), none, best)
     backend.run(best)
     return best
+
+
+def _rounding(face: Any) -> Any:
+    """By how much, at most, rounding moves where a ray crosses a face."""
+    size = type(face.corners[0].a)(0)
+    for corner in face.corners:
+        for value in (corner.a, corner.b, corner.values[0]):
+            size = dr.fmax(size, dr.abs(value))
+    return 16.0 * dr.epsilon(size) * size

@@ -60,6 +60,9 @@ class _ForwardKernel:
 
     def visit(self, step: Step, ray: Radiance) -> Radiance:
         entry, leaving = step.entry, step.leaving
+        if self.view.transfer is not None:
+            entry = self.view.transfer.bounded(entry, step.face)
+            leaving = self.view.transfer.bounded(leaving, step.next_face)
         if self.span is not None:
             clip = self.span.clip(entry[0], leaving[0])
             entry, leaving = clip.start(entry, leaving), clip.end(entry, leaving)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +13,7 @@ from difftetvr.backend import backend_for
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.render.api import prepare_view
 from difftetvr.render.camera import Camera
+from difftetvr.render.clip_plane import clip_limits
 from difftetvr.render.crossing import Rays, Span, Step, Tracer, corner_of, read_vertex
 from difftetvr.render.walk import Corner, Face
 
@@ -30,19 +32,25 @@ class RayStatistics:
 
 
 @torch.no_grad()
-def inspect_rays(mesh: TetMesh, camera: Camera, renderer: str = "marching") -> RayStatistics:
+def inspect_rays(
+    mesh: TetMesh,
+    camera: Camera,
+    renderer: str = "marching",
+    clip_plane: Sequence[float] | torch.Tensor | None = None,
+) -> RayStatistics:
     """Count the cells that rays cross, and find the worst of them (as the front end of the original does).
 
     Args:
         mesh: The mesh.
         camera: The camera.
         renderer: How crossings are found, see :func:`difftetvr.render.render`.
+        clip_plane: Only cells that reach into this half-space on the ray count; see there, too.
 
     Returns:
         The statistics, on the device of the mesh.
 
     Raises:
-        DiffTetError: There is no such renderer.
+        DiffTetError: There is no such renderer, or the plane is none.
         BackendError: No back end runs on the device of the mesh.
     """
     quality = mesh.quality()
@@ -50,8 +58,9 @@ def inspect_rays(mesh: TetMesh, camera: Camera, renderer: str = "marching") -> R
     color = torch.stack((quality, torch.zeros_like(quality), torch.zeros_like(quality)), dim=1)
     view = prepare_view(mesh, Field(color, torch.zeros_like(quality), "cell"), camera, None, 0.0, False, renderer)
     backend, size = backend_for(mesh.vertices), (camera.height, camera.width)
+    limits = None if clip_plane is None else clip_limits(clip_plane, camera, mesh.vertices) / view.unit
     with backend.exclusive():
-        tracer = view.task.tracer(view.vertices, None, view.parts)
+        tracer = view.task.tracer(view.vertices, limits, view.parts)
         count = dr.zeros(backend.Int, camera.height * camera.width)
         worst = dr.zeros(backend.Float, camera.height * camera.width)
         tracer.trace(lambda rays: _InspectionKernel(tracer, rays, count, worst))
@@ -83,8 +92,12 @@ class _InspectionKernel:
 
     def visit(self, step: Step, ray: _Inspected) -> _Inspected:
         quality = dr.gather(self.view.backend.Float4, self.view.cells, step.cell)[0]
-        # What lies behind the camera is not met, whichever renderer comes across it.
-        met = dr.mask_t(quality)(True) if self.span is None else step.leaving[0] > self.span.near
+        # What lies behind the camera or is clipped is not met, whichever renderer comes across it.
+        met = dr.mask_t(quality)(True)
+        if self.span is not None:
+            met &= step.leaving[0] > self.span.near
+            if self.span.far is not None:
+                met &= step.entry[0] < self.span.far
         count = ray.count + dr.select(met, 1, 0)
         return _Inspected(count, dr.select(met, dr.fmin(ray.worst, quality), ray.worst), ray.transmittance)
 

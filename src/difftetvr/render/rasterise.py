@@ -17,6 +17,7 @@ _ITEM_PIXELS = 64  # a work item has about so many pixels, at most _ITEM_ROWS ro
 _ITEM_ROWS = 8
 # Beyond what rounding moves a projection by, for images of up to 64 k pixels; the exact rule decides.
 _MARGIN = 0.0625
+_NEAR_PLANE = 2.0**-8  # points nearer to the camera's plane, in units of their distance, are not projected
 
 
 @dataclass
@@ -81,25 +82,64 @@ def pixel_range(scene: FaceScene, points: list[list[Any]]) -> tuple[tuple[Any, A
         First and last column, first and last row, and whether there are any.
     """
     real, pinhole = scene.backend.Float, scene.pinhole
-    infinity = real(dr.inf)
-    low, high = [infinity, infinity], [-infinity, -infinity]
-    nearest, farthest = infinity, -infinity
-    for x, y, z in points:
-        inverse = 1.0 / z
-        for axis, value in enumerate((x * inverse * pinhole.fx + pinhole.cx, y * inverse * pinhole.fy + pinhole.cy)):
-            low[axis] = dr.fmin(low[axis], value)
-            high[axis] = dr.fmax(high[axis], value)
-        nearest, farthest = dr.fmin(nearest, z), dr.fmax(farthest, z)
-    crosses = nearest <= 0  # part of the hull lies behind the camera: its projection is unbounded
+    size, farthest = _size(points), real(-dr.inf)
+    for point in points:
+        farthest = dr.fmax(farthest, point[2])
+    # Points behind the camera, or so near to its plane that rounding moves their projection, have no place in it.
+    ahead = [point[2] > size * _NEAR_PLANE for point in points]
     box = []
-    for axis, size in enumerate((pinhole.width, pinhole.height)):
-        last = real(size) - 1.0
+    for axis, scale, center, pixels in (
+        (0, pinhole.fx, pinhole.cx, pinhole.width),
+        (1, pinhole.fy, pinhole.cy, pinhole.height),
+    ):
+        low, high = _projection(points, axis, ahead, size)
+        last = real(pixels) - 1.0
         # Pixel i's ray goes through i + 1/2: those from ceil(low - 1/2) to floor(high - 1/2) may see the face.
-        begin = dr.select(crosses, 0.0, dr.fmin(dr.fmax(dr.ceil(low[axis] - (0.5 + _MARGIN)), 0.0), last + 1.0))
-        end = dr.select(crosses, last, dr.fmin(dr.fmax(dr.floor(high[axis] - (0.5 - _MARGIN)), -1.0), last))
+        begin, end = dr.ceil(low * scale + center - (0.5 + _MARGIN)), dr.floor(high * scale + center - (0.5 - _MARGIN))
+        begin, end = dr.fmin(dr.fmax(begin, 0.0), last + 1.0), dr.fmin(dr.fmax(end, -1.0), last)
         box.append((scene.backend.Int(begin), scene.backend.Int(end)))
     columns, rows = box
-    return columns, rows, (farthest > 0) & (columns[1] >= columns[0]) & (rows[1] >= rows[0])
+    visible = (farthest > -_rounding(size)) & (columns[1] >= columns[0]) & (rows[1] >= rows[0])
+    return columns, rows, visible
+
+
+def _projection(points: list[list[Any]], axis: int, ahead: list[Any], size: Any) -> tuple[Any, Any]:
+    """Range of x / z, or y / z, over the part of a convex hull in front of the camera; infinite where it has no end.
+
+    Seen from a point ahead, one that is not lies on the one side or on the other. On this side there is no end, on the
+    other one the points ahead are.
+    """
+    infinity = dr.inf + 0.0 * size
+    low, high, any_ahead = infinity, -infinity, dr.mask_t(size)(False)
+    for point, is_ahead in zip(points, ahead, strict=True):
+        value = point[axis] / point[2]
+        low = dr.fmin(low, dr.select(is_ahead, value, infinity))
+        high = dr.fmax(high, dr.select(is_ahead, value, -infinity))
+        any_ahead |= is_ahead
+    for one, is_ahead in zip(points, ahead, strict=True):
+        for other, other_is_ahead in zip(points, ahead, strict=True):
+            if one is other:
+                continue
+            crosses = is_ahead & ~other_is_ahead
+            side = other[axis] * one[2] - one[axis] * other[2]
+            sure = _rounding(size) * (dr.abs(one[axis]) + dr.abs(other[axis]) + dr.abs(one[2]) + dr.abs(other[2]))
+            low = dr.select(crosses & (side < sure), -infinity, low)
+            high = dr.select(crosses & (side > -sure), infinity, high)
+    return dr.select(any_ahead, low, -infinity), dr.select(any_ahead, high, infinity)
+
+
+def _size(points: list[list[Any]]) -> Any:
+    """Greatest coordinate of some points."""
+    size = type(points[0][0])(0)
+    for point in points:
+        for value in point:
+            size = dr.fmax(size, dr.abs(value))
+    return size
+
+
+def _rounding(size: Any) -> Any:
+    """By how much, at most, a ray's frame moves points of which ``size`` is the greatest coordinate."""
+    return 16.0 * dr.epsilon(size) * size
 
 
 def _may_face_camera(points: list[list[Any]]) -> Any:
@@ -123,7 +163,7 @@ def for_each_hit(scene: FaceScene, items: WorkItems | None, visit: Callable[[Hit
         return
     vertices = scene.indices(items.face)
     points = [scene.point(vertex) for vertex in vertices]
-    passes_camera = dr.fmin(points[0][2], dr.fmin(points[1][2], points[2][2])) <= 0
+    passes_camera = dr.fmin(points[0][2], dr.fmin(points[1][2], points[2][2])) <= _rounding(_size(points))
 
     def body(column: Any, row: Any) -> tuple[Any, Any]:
         frame = pixel_frame(scene.pinhole, column, row)
@@ -132,7 +172,8 @@ def for_each_hit(scene: FaceScene, items: WorkItems | None, visit: Callable[[Hit
             a, b, t = frame.project(*point)
             corners.append(Corner(vertex, a, b, [t], []))
         face = make_face(corners)
-        # Only where some corners lie behind the camera, the sign of the distance is in doubt and must be the exact one.
+        # Only where corners lie behind the camera, or nearly so, the sign of the distance is in doubt and must be the
+        # exact one.
         exact = lambda face: crossing_depth(face)  # noqa: E731
         simple = lambda face: interpolate(face)[0]  # noqa: E731
         depth = dr.if_stmt((face,), passes_camera, exact, simple)

@@ -15,6 +15,7 @@ import drjit as dr
 import torch
 
 from difftetvr.backend import Backend
+from difftetvr.render.walk import Face
 
 
 @dataclass
@@ -39,12 +40,22 @@ class Transfer:
     def of(backend: Backend, knots: torch.Tensor, values: torch.Tensor) -> Transfer:
         """Upload (K,) knots and (K, 4) densities and colours."""
         count = knots.shape[0]
-        arrays = backend.floats(knots), backend.floats(values)
+        # A copy: the backward pass wants the knots as they are now, whatever becomes of the caller's tensor.
+        arrays = backend.floats(knots.clone()), backend.floats(values)
         return Transfer(backend, *arrays, dr.opaque(backend.Int, count), count.bit_length())
 
     def knot(self, index: Any, active: Any = True) -> Any:
         """Scalar of a knot."""
         return dr.gather(self.backend.Float, self.knots, self.backend.UInt(index), active)
+
+    def bounded(self, values: list[Any], face: Face) -> list[Any]:
+        """Distance and scalar at a face, the scalar within those of its corners.
+
+        Where these are all one number, rounding must not carry it across a jump at that number.
+        """
+        first, second, third = (corner.values[1] for corner in face.corners)
+        low, high = dr.fmin(dr.fmin(first, second), third), dr.fmax(dr.fmax(first, second), third)
+        return [values[0], dr.fmin(dr.fmax(values[1], low), high)]
 
     def interval(self, scalar: Any, inclusive: Any) -> Any:
         """Last knot below a scalar, or at it where ``inclusive``; -1 where there is none."""

@@ -269,7 +269,7 @@ def _require_convertible(request: _Request, block: CellBlock, num_vertices: int)
     if block.kind != "tetra" and not request.split:
         raise MeshError(
             f"{path} holds {count:,} cells of type '{block.kind}'; only linear tetrahedra can be rendered, so load "
-            "with split=True to make tetrahedra of them."
+            "with split=True (--split of render, info and export) to make tetrahedra of them."
         )
     require_array(path, f"cells of type '{block.kind}'", block.nodes, num_nodes(block.kind), "iu")
     outside = (block.nodes < 0) | (block.nodes >= num_vertices)
