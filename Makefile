@@ -2,8 +2,8 @@
 # Paths are relative throughout, so the folder's own path may hold spaces.
 
 BIN := .venv/bin
-# Which scripts `make bench` runs; the studies of the Tooth take hours, and have commands of their own.
-BENCHMARKS ?= $(filter-out benchmarks/tooth%.py,$(wildcard benchmarks/*.py))
+# Which scripts `make bench` runs; the studies of the Tooth and of photographs have commands of their own.
+BENCHMARKS ?= $(filter-out benchmarks/tooth%.py benchmarks/photos.py,$(wildcard benchmarks/*.py))
 
 .PHONY: help setup demo test lint bench clean distclean
 

@@ -3,8 +3,8 @@
 The scene is that of vtk_compare.py: the cube [-0.5, 0.5]^3 as a Kuhn grid with a smooth field, seen from outside. Every
 row runs in a process of its own: three repetitions after one that compiles the kernels, medians. "Forward" is
 `render` without gradients, "backward" the backward pass with gradients of colours, densities and positions. "Memory" is
-the peak of the process beyond what it held with mesh, field and kernels loaded (Linux only), for both passes and with
-the gradients.
+the peak of the process beyond what it held with mesh, adjacency and field (Linux only), over both passes and with the
+gradients; one copy of them a thread and the kernels' machine code are in it.
 
     python benchmarks/renderers.py [--repetitions 3] [--skip-large]
 """
@@ -64,9 +64,12 @@ def measure(cubes: int, pixels: int, renderer: str, repetitions: int) -> dict[st
     from difftetvr.render import Camera, OrderWarning, render
 
     warnings.simplefilter("error", OrderWarning)
-    mesh = TetMesh.grid((cubes,) * 3, (-0.5,) * 3, (0.5,) * 3)
-    field = smooth_field(mesh.vertices)
     camera = Camera.look_at((1.05, 0.62, 0.48), (0.0, 0.0, 0.0), width=pixels, height=pixels)
+    small = TetMesh.grid((2, 2, 2))
+    render(small, smooth_field(small.vertices), camera.with_size(16, 16), renderer=renderer)  # loads compiler and all
+    mesh = TetMesh.grid((cubes,) * 3, (-0.5,) * 3, (0.5,) * 3)
+    _ = mesh.topology.cell_adjacency
+    field = smooth_field(mesh.vertices)
     leaves = [t.detach().clone().requires_grad_() for t in (mesh.vertices, field.color, field.density)]
 
     def forward() -> None:
@@ -83,13 +86,14 @@ def measure(cubes: int, pixels: int, renderer: str, repetitions: int) -> dict[st
         loss.backward()
         return time.perf_counter() - start
 
-    forward()
-    backward()
     before = resident("VmRSS")
     forget_peak()
+    forward()
+    backward()
+    memory = resident("VmHWM") - before
     result = {"forward": seconds(forward, repetitions)}
     result["backward"] = statistics.median(backward() for _ in range(repetitions))
-    return result | {"memory": resident("VmHWM") - before}
+    return result | {"memory": memory}
 
 
 def row(cubes: int, pixels: int, renderer: str, repetitions: int) -> dict[str, float]:
@@ -133,7 +137,7 @@ def main() -> None:
             found = row(cubes, pixels, renderer, options.repetitions)
             numbers = (f"{1e3 * found['forward']:,.0f}", f"{1e3 * found['backward']:,.0f}", f"{found['memory']:,.0f}")
             table.add_row(f"{6 * cubes**3:,}", f"{pixels} x {pixels}", f"{complexity:.0f}", renderer, *numbers)
-    Console().print(table)
+    Console(width=120).print(table)
 
 
 if __name__ == "__main__":

@@ -31,6 +31,7 @@ CANDIDATES = {
     "two views an iteration": {"batch_views": 2},
     "4800 iterations, 80 rounds": changed(iterations=4800, exchange={"rounds": 80}),
     "l1 loss": {"loss": "l1"},
+    "SSIM in the loss": {"loss": "l1-ssim"},
     "no moves": {"move": False},
 }
 

@@ -206,6 +206,7 @@ def test_unit_of_length_does_not_matter() -> None:
         ({"scalar": torch.tensor([0.0, float("nan")])}, "Scalar 1 is not finite"),
         ({"scalar": torch.zeros(4), "attenuation": -1.0}, "attenuation"),
         ({"scalar": torch.zeros(4), "value_range": (1.0, 1.0)}, "range"),
+        ({"scalar": torch.zeros(4), "value_range": 5}, "range"),
         ({"scalar": torch.zeros(4), "location": "edge"}, "location"),
     ],
 )

@@ -28,8 +28,8 @@ class Fit:
     """Reconstruct a tetrahedral volume from images."""
 
     capture: Annotated[str, Positional, arg(metavar="CAPTURE")]
-    """What to fit: tooth (the built-in CT scan), or the path of a volume, of photographs with their cameras (NeRF-synthetic,
-    transforms.json, COLMAP, cameras.json), or of a saved capture (.npz)."""
+    """What to fit: tooth (the built-in CT scan), or the path of a volume, of photographs with their cameras
+    (NeRF-synthetic, transforms.json, COLMAP, cameras.json), or of a saved capture (.npz)."""
     output: Output
     """Folder for the model, its metrics, pictures and checkpoint."""
     config: Annotated[FitConfig, arg(name="")] = field(default_factory=FitConfig)

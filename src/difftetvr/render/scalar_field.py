@@ -52,7 +52,10 @@ class ScalarField:
         if not (math.isfinite(self.attenuation) and self.attenuation >= 0):
             raise MeshError(f"The attenuation is {self.attenuation}; it must be finite and not negative.")
         if self.value_range is not None:
-            low, high = self.value_range
+            try:
+                low, high = (float(value) for value in self.value_range)
+            except (TypeError, ValueError):
+                low, high = math.nan, math.nan
             if not (math.isfinite(low) and math.isfinite(high) and low < high):
                 raise MeshError(f"The range of the scalars is {self.value_range}; give two numbers, the smaller first.")
         if self.location not in (None, "vertex", "cell"):

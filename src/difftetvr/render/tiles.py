@@ -11,8 +11,8 @@ import torch
 from difftetvr.render.entry_table import HalfFaceScene
 from difftetvr.render.rasterise import pixel_range
 
-TILE_BITS = 3
-"""Tiles have 8 x 8 pixels, so that the rays of a tile lie side by side in the lanes' Morton order."""
+TILE_BITS = 2
+"""Tiles have 4 x 4 pixels: those of 16 lanes that lie side by side in Morton order, a vector of AVX-512."""
 
 
 @dataclass
