@@ -49,7 +49,8 @@ class Fit:
         folder.require_free(resume=self.resume, overwrite=self.overwrite)
         capture = self.views_of.load(self.capture, console)
         trainer = prepare(capture, self.config, resume_from=folder.checkpoint if self.resume else None)
-        _print_choices(console, self.config, trainer.config)
+        if capture.encoding == "srgb":
+            _print_choices(console, self.config, trainer.config)
         if self.config.initial_mesh is not None:
             _print_start(console, self.config.initial_mesh, trainer)
         # Only now: what cannot even start neither leaves a folder behind nor costs the run that is to be replaced.
@@ -99,7 +100,7 @@ class Fit:
 
 
 def _print_choices(console: Console, given: FitConfig, chosen: FitConfig) -> None:
-    """Says what was chosen for the images where the options left it open."""
+    """Says what was chosen for photographs where the options left it open."""
     open_options = [item.name for item in dataclasses.fields(given) if item.name in CHOSEN_FOR_CAPTURE]
     choices = [f"--{name} {getattr(chosen, name)}" for name in open_options if getattr(given, name) is None]
     if choices:
