@@ -16,8 +16,8 @@ from difftetvr.backend import backend_for
 from difftetvr.errors import DiffTetError, MeshError
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.render import Camera, OrderWarning, linked_list, projected, render
+from difftetvr.render.bands import bands_of
 from difftetvr.render.entry_table import HalfFaceScene
-from difftetvr.render.fragments import bands_of
 from difftetvr.render.inspection import inspect_rays
 from difftetvr.render.tiles import Tiler
 

@@ -84,7 +84,7 @@ def render(
         raise DiffTetError(f"There is no renderer '{renderer}'; choose one of {', '.join(RENDERERS)}.")
     view = prepare_view(mesh, field, camera, optics, transmittance_threshold, deterministic, renderer)
     behind = as_background(background, mesh.vertices)
-    limits = None if clip_plane is None else clip_limits(clip_plane, camera, mesh.vertices) / view.unit
+    limits = view.limits(clip_plane)
     light, distance = RenderFunction.apply(view.task, view.vertices, limits, *view.parts)
     return compose(light, _times(distance, view.unit), behind)
 
@@ -104,6 +104,10 @@ class PreparedView:
     vertices: torch.Tensor
     parts: tuple[torch.Tensor, ...]
     unit: float
+
+    def limits(self, clip_plane: Any) -> torch.Tensor | None:
+        """What :func:`difftetvr.render.clip_plane.clip_limits` says of a plane, in that unit; None without one."""
+        return None if clip_plane is None else clip_limits(clip_plane, self.task.camera, self.vertices) / self.unit
 
 
 def prepare_view(

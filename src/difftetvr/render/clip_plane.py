@@ -37,18 +37,11 @@ def clip_limits(plane: Any, camera: Camera, like: torch.Tensor) -> torch.Tensor:
     pose = camera.world_to_camera.to(like)
     normal = pose[:3, :3] @ coefficients[:3]
     at_camera = coefficients[3] - normal @ pose[:3, 3]
-    slope = _directions(camera, like) @ normal
+    directions = camera.ray_directions().to(like.dtype)  # before the device: not all of them know float64
+    slope = directions.to(like.device) @ normal
     # Along a ray the plane's function is slope * t + at_camera.
     crossing = -at_camera / torch.where(slope == 0, 1.0, slope)
     nowhere = torch.where(at_camera < 0, -1.0, torch.inf)
     near = torch.where(slope > 0, crossing.clamp(min=0), 0.0)
     far = torch.where(slope < 0, crossing, torch.where(slope == 0, nowhere, torch.inf))
     return torch.stack((near, far), dim=-1)
-
-
-def _directions(camera: Camera, like: torch.Tensor) -> torch.Tensor:
-    """(H, W, 3) unit directions of the pixels' rays in camera space."""
-    x = (torch.arange(camera.width, dtype=like.dtype, device=like.device) + 0.5 - camera.cx) / camera.fx
-    y = (torch.arange(camera.height, dtype=like.dtype, device=like.device) + 0.5 - camera.cy) / camera.fy
-    rows, columns = torch.meshgrid(y, x, indexing="ij")
-    return torch.nn.functional.normalize(torch.stack((columns, rows, torch.ones_like(rows)), dim=-1), dim=-1)

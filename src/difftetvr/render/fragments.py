@@ -14,6 +14,7 @@ import drjit as dr
 import torch
 
 from difftetvr.mesh import TetMesh
+from difftetvr.render.bands import Band
 from difftetvr.render.camera_inside import cells_around_camera
 from difftetvr.render.entry_table import HalfFaceScene
 from difftetvr.render.rasterise import Hit, for_each_hit, work_items
@@ -24,15 +25,6 @@ NONE = 0xFFFFFFFF
 """Ends a list."""
 
 _FACES_AT_A_TIME = 1 << 22  # bounds the memory of work items
-
-
-@dataclass(frozen=True)
-class Band:
-    """Lanes from ``first`` to before ``last``, which have ``total`` fragments."""
-
-    first: int
-    last: int
-    total: int
 
 
 @dataclass
@@ -123,21 +115,3 @@ class FragmentRaster:
             return (index + 1,)
 
         dr.while_loop((dr.zeros(uint, dr.width(column)),), lambda index: index < count, body)
-
-
-def bands_of(counts: torch.Tensor, budget: int) -> list[Band]:
-    """Cut the lanes into bands of at most ``budget`` fragments each, or of one lane that has more.
-
-    Args:
-        counts: (lanes,) int64 fragments of each lane.
-        budget: Fragments that may be held at a time.
-    """
-    ends = counts.cumsum(0).cpu()
-    bands, first, before = [], 0, 0
-    while first < counts.shape[0]:
-        last = int(torch.searchsorted(ends, before + budget, right=True))
-        last = min(max(last, first + 1), counts.shape[0])
-        total = int(ends[last - 1]) - before
-        bands.append(Band(first, last, total))
-        first, before = last, before + total
-    return bands

@@ -13,7 +13,6 @@ from difftetvr.backend import backend_for
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.render.api import prepare_view
 from difftetvr.render.camera import Camera
-from difftetvr.render.clip_plane import clip_limits
 from difftetvr.render.crossing import Rays, Span, Step, Tracer, corner_of, read_vertex
 from difftetvr.render.walk import Corner, Face
 
@@ -58,7 +57,7 @@ def inspect_rays(
     color = torch.stack((quality, torch.zeros_like(quality), torch.zeros_like(quality)), dim=1)
     view = prepare_view(mesh, Field(color, torch.zeros_like(quality), "cell"), camera, None, 0.0, False, renderer)
     backend, size = backend_for(mesh.vertices), (camera.height, camera.width)
-    limits = None if clip_plane is None else clip_limits(clip_plane, camera, mesh.vertices) / view.unit
+    limits = view.limits(clip_plane)
     with backend.exclusive():
         tracer = view.task.tracer(view.vertices, limits, view.parts)
         count = dr.zeros(backend.Int, camera.height * camera.width)

@@ -16,9 +16,10 @@ import torch
 
 from difftetvr.backend import Backend
 from difftetvr.mesh import TetMesh
+from difftetvr.render.bands import Band, bands_of
 from difftetvr.render.crossing import Kernel, Rays, View, cross_cell, make_rays
 from difftetvr.render.entry_table import HalfFaceScene
-from difftetvr.render.fragments import NONE, Band, FragmentLists, FragmentRaster, bands_of
+from difftetvr.render.fragments import NONE, FragmentLists, FragmentRaster
 
 FRAGMENT_BUDGET = 1 << 26
 """Fragments that lists may hold at a time, of 12 bytes each in float32."""

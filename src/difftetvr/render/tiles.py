@@ -8,6 +8,7 @@ from typing import Any
 import drjit as dr
 import torch
 
+from difftetvr.render.bands import bands_of
 from difftetvr.render.entry_table import HalfFaceScene
 from difftetvr.render.rasterise import pixel_range
 
@@ -57,7 +58,7 @@ class Tiler:
         # Cells out of sight are left out: often they are most of all.
         self.cells = order.to(torch.int32)[seen]
         self.pairs, self.width, self.first = (backend.tensor(part)[seen] for part in (pairs, self.width, self.first))
-        self.parts = _parts(self.pairs, budget)
+        self.parts = [slice(band.first, band.last) for band in bands_of(self.pairs.long(), budget)]
 
     def lists(self, part: slice) -> TileLists:
         """Lists of the cells at some places of the order."""
@@ -81,14 +82,3 @@ class Tiler:
 
 def _tiles(pixels: int) -> int:
     return -(-pixels // (1 << TILE_BITS))
-
-
-def _parts(pairs: torch.Tensor, budget: int) -> list[slice]:
-    """Consecutive cells with at most ``budget`` pairs in all, or a single one that has more."""
-    ends = pairs.long().cumsum(0).cpu()
-    parts, first, before = [], 0, 0
-    while first < ends.shape[0]:
-        last = max(int(torch.searchsorted(ends, before + budget, right=True)), first + 1)
-        parts.append(slice(first, last))
-        first, before = last, int(ends[last - 1])
-    return parts
