@@ -68,7 +68,7 @@ def measure(run: ArticleRun) -> dict[str, Any]:
     lower, upper = capture.bounds.tolist()
     mesh = dtv.TetMesh.grid((8, 8, 13), lower, upper)
     assert mesh.num_cells == KUHN_CELLS["5 k"]
-    parameters = FieldParameters(mesh, config, capture.density_unit)
+    parameters = FieldParameters(mesh, config, capture.density_units_at(mesh.vertices))
     vertices = mesh.vertices.clone().requires_grad_(run.position_rate > 0)
     mover = torch.optim.Adam([vertices], lr=run.position_rate or 1.0, betas=BETAS, eps=1e-15)
     inner = torch.ones(mesh.num_vertices, 1)

@@ -1,4 +1,4 @@
-"""Every error a user can cause: one sentence that says what is wrong, where, and what to do."""
+"""Every error a user can cause: one sentence that says what is wrong, where, and what to do; and how it counts."""
 
 from __future__ import annotations
 
@@ -21,3 +21,14 @@ class CameraError(DiffTetError):
 
 class BackendError(DiffTetError):
     """No Dr.Jit back end can run the kernels on this machine or on the device of the given tensors."""
+
+
+def counted(number: int, noun: str, plural: str | None = None) -> str:
+    """A number with what it counts: 1 cell, 1,200 cells.
+
+    Args:
+        number: How many.
+        noun: What one of them is called.
+        plural: What others are called; default: the noun with an s.
+    """
+    return f"{number:,} {noun if number == 1 else plural or noun + 's'}"

@@ -231,7 +231,7 @@ def test_captures_of_the_first_version_are_read(tmp_path: Path) -> None:
     capture.save(tmp_path / "c.npz")
     with np.load(tmp_path / "c.npz") as archive:
         content = dict(archive)
-    old = {key: value for key, value in content.items() if key != "encoding"}
+    old = {key: value for key, value in content.items() if key not in ("encoding", "surroundings")}
     old |= {
         "version": np.array(1),
         "images": content["images"] / np.float32(255),
@@ -239,10 +239,10 @@ def test_captures_of_the_first_version_are_read(tmp_path: Path) -> None:
     }
     np.savez(tmp_path / "old.npz", **old)
     again = Capture.load(tmp_path / "old.npz")
-    assert again.encoding == "linear" and again.points is None and again.valid is None
+    assert (again.encoding, again.surroundings) == ("linear", 1.0) and again.points is None and again.valid is None
     assert isinstance(again.images, torch.Tensor) and torch.equal(again.images[3], capture.images[3])
-    np.savez(tmp_path / "new.npz", **{**content, "version": np.array(3)})
-    with pytest.raises(CaptureError, match="version 3; update"):
+    np.savez(tmp_path / "new.npz", **{**content, "version": np.array(4)})
+    with pytest.raises(CaptureError, match="version 4; update"):
         Capture.load(tmp_path / "new.npz")
 
 

@@ -63,7 +63,7 @@ def test_lists_of_file_names_are_the_split(tmp_path: Path) -> None:
 
 def test_instant_ngp_box(tmp_path: Path) -> None:
     write_transforms(tmp_path, suffix=".jpg", aabb_scale=2)
-    np.testing.assert_allclose(load_capture(tmp_path).bounds, [[-1 / 0.33] * 3, [1 / 0.33] * 3], rtol=1e-6)
+    np.testing.assert_allclose(load_capture(tmp_path).bounds, [[-0.5 / 0.33] * 3, [0.5 / 0.33] * 3], rtol=1e-6)
     edit(tmp_path, lambda c: c.update(aabb_scale=1, scale=0.5, offset=[0.5, 0.25, 0.5]))
     np.testing.assert_allclose(load_capture(tmp_path).bounds, [[-1, -0.5, -1], [1, 1.5, 1]])
     # Silhouettes say more.
@@ -187,7 +187,8 @@ def test_real_fox(shared_data: Path) -> None:
     # Its lens hardly distorts.
     assert capture.cameras[0].fx == pytest.approx(1375.52 / 8, rel=0.02)
     assert 0.2 < float(capture.images.mean()) < 0.8
-    np.testing.assert_allclose(capture.bounds[1], [2 / 0.33] * 3, rtol=1e-6)
+    np.testing.assert_allclose(capture.bounds[1], [0.5 / 0.33] * 3, rtol=1e-6)
+    assert capture.surroundings == 8.0
 
 
 def test_picture_is_seen_where_the_camera_says() -> None:

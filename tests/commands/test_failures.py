@@ -71,7 +71,7 @@ def test_mistakes_of_the_program_are_not_hidden(run, monkeypatch):
 def test_a_failed_start_leaves_nothing(tmp_path, capsys, monkeypatch, error, where, existing):
     """Neither a run that refuses the next attempt nor the folders made for it."""
     target = {
-        "prepare": (TRAINER, "build_grid"),
+        "prepare": (TRAINER, "starting_mesh"),
         "step": (Trainer, "step"),
         "save": (Checkpoint, "save"),
     }[where]
@@ -108,7 +108,7 @@ def test_what_cannot_start_does_not_cost_the_run_that_was_to_be_replaced(run, tm
     folder = tmp_path / "out"
     shutil.copytree(run, folder)
     with monkeypatch.context() as patch:
-        patch.setattr(TRAINER, "build_grid", raising(MemoryError()))
+        patch.setattr(TRAINER, "starting_mesh", raising(MemoryError()))
         fails(capsys, "fit", "tooth", "-o", folder, *VIEWS, *FIT, "--overwrite")
     assert {p.name: p.read_bytes() for p in folder.glob("*.*")} == {p.name: p.read_bytes() for p in run.glob("*.*")}
 
@@ -146,10 +146,11 @@ def test_damaged_options_of_a_run(run, tmp_path, capsys, change):
     shutil.copytree(run, folder)
     saved = json.loads((run / "config.json").read_text())
     (folder / "config.json").write_text(json.dumps(saved | change))
-    assert f"{folder}/config.json is damaged" in fails(capsys, "fit", "tooth", "-o", folder, "--resume")
+    said = fails(capsys, "fit", "tooth", "-o", folder, "--resume")
+    assert f"--resume cannot use {folder}/config.json (start anew with --overwrite, or mend it): " in said
     for name in change:
         (folder / "config.json").write_text(json.dumps({k: v for k, v in saved.items() if k != name}))
-        assert "lacks" in fails(capsys, "fit", "tooth", "-o", folder, "--resume")
+        assert f"option '{name}' is missing" in fails(capsys, "fit", "tooth", "-o", folder, "--resume")
 
 
 def test_folder_in_place_of_the_checkpoint(run, tmp_path, capsys):

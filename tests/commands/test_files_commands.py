@@ -49,7 +49,7 @@ def test_info_names_data_and_flat_cells(flat_mesh, capsys):
 def test_info_of_other_cells(tmp_path, capsys):
     path = tmp_path / "a.vtk"
     path.write_text(HEXAHEDRON)
-    assert "1 cells of type 'hexahedron'" in fails(capsys, "info", path)
+    assert "1 cell of type 'hexahedron'" in fails(capsys, "info", path)
     assert cli.main(["info", str(path), "--split"]) == 0
     output = capsys.readouterr().out
     assert "[b]heat" in output and "0 to 7" in output and "6" in output
@@ -72,7 +72,7 @@ def test_export_says_what_is_left_out(tmp_path, flat_mesh, capsys):
     assert cli.main(["export", str(flat_mesh), str(target), "--geometry"]) == 0
     output = capsys.readouterr().out
     assert "1 of 2 cells has no volume" in output
-    assert "(1 cells, geometry only, without color, density, heat, pressure)" in output
+    assert "(1 cell, geometry only, without color, density, heat, pressure)" in output
     assert "no format that holds" in fails(capsys, "export", flat_mesh, tmp_path / "a.ply")
     hexahedron = tmp_path / "a.vtk"
     hexahedron.write_text(HEXAHEDRON)

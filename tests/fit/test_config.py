@@ -5,7 +5,7 @@ import json
 import pytest
 
 from difftetvr.fit import FitConfig, FitError
-from difftetvr.fit.config import grid_cubes
+from difftetvr.mesh.generators import grid_cubes
 
 TOOTH = (103, 94, 161)
 
@@ -111,7 +111,7 @@ def test_json_round_trip():
         {"cells": "many"},
         {"cells": 2.5},
         {"cells": True},
-        {"cells": None},
+        {"seed": None},
         {"rate": "fast"},
         {"rate": True},
         {"betas": [0.9]},

@@ -212,7 +212,7 @@ def test_checkpoint_of_another_version(begun, tmp_path, monkeypatch):
     dumps = json.dumps
     monkeypatch.setattr(json, "dumps", lambda state: dumps(state | {"version": 1}))
     begun.checkpoint().save(path)
-    with pytest.raises(FitError, match="has version 1, this program reads version 3; start anew"):
+    with pytest.raises(FitError, match="has version 1, this program reads version 4; start anew"):
         Checkpoint.load(path)
 
 
@@ -274,7 +274,7 @@ def test_options_learn_too(small_capture, options):
 def test_haze_that_no_image_sees_decays(penalty):
     """Densities without any gradient stay as they are, unless the penalty pulls them to zero; seen ones win."""
     mesh = TetMesh.grid((2, 2, 2))
-    parameters = FieldParameters(mesh, FitConfig(initial_density=0.3), density_unit=25.0)
+    parameters = FieldParameters(mesh, FitConfig(initial_density=0.3), torch.full((mesh.num_vertices,), 25.0))
     for _ in range(60):
         parameters.zero_grad()
         (-(parameters.density[:3].sum())).backward()

@@ -52,13 +52,14 @@ def test_what_is_left_open_is_chosen_for_the_images(shiny: dtv.Capture) -> None:
     assert dtv.FitConfig().for_capture(opaque).background == "black"
     light = dataclasses.replace(shiny, encoding="linear")
     assert (light.encoding, dtv.FitConfig().for_capture(light).harmonics) == ("linear", 0)
-    given = dtv.FitConfig(background="white", harmonics=0)
+    given = dtv.FitConfig(background="white", harmonics=0, cells=500, start="grid", iterations=9)
     assert given.for_capture(shiny) == given
     assert dtv.FitConfig.from_json(chosen.to_json()) == chosen
 
 
 def test_directional_colours_are_recovered(shiny: dtv.Capture) -> None:
-    options = FAST | {"move": False, "refine": "none", "iterations": 200, "grid": (4, 4, 4)}  # that of the truth
+    options = FAST | {"move": False, "refine": "none", "iterations": 200, "harmonics_rate": 0.5}
+    options |= {"grid": (4, 4, 4), "start": "grid"}  # the truth's
     flat = dtv.fit(shiny, dtv.FitConfig(harmonics=0, **options))
     directional = dtv.fit(shiny, dtv.FitConfig(harmonics=1, **options))
     assert flat.field.harmonics is None

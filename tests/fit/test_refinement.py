@@ -72,8 +72,13 @@ def applied(values, refinement):
     return values if refinement.surplus is None else values + refinement.surplus
 
 
+def test_long_runs_are_refined_more_often():
+    due = [sum(Exchange().is_due(Moment(i, n, 64, 900, 1000)) for i in range(n)) for n in (1200, 2400, 4800)]
+    assert due == [40, 40, 80]
+
+
 @pytest.mark.parametrize("iterations", [30, 240, 2400])
-@pytest.mark.parametrize("strategy", [Exchange(), Exchange(rounds=3, until=0.5), Grow(rounds=7)])
+@pytest.mark.parametrize("strategy", [Exchange(rounds=40), Exchange(rounds=3, until=0.5), Grow(rounds=7)])
 def test_rounds_are_spread_over_the_run(strategy, iterations):
     due = [i for i in range(iterations) if strategy.is_due(Moment(i, iterations, 64, 900, 1000))]
     assert len(due) == min(strategy.rounds, int(strategy.until * iterations) + 1)
@@ -272,5 +277,5 @@ def test_an_exchange_lowers_the_error_and_keeps_the_budget(scene, strategy):
     ],
 )
 def test_refuses_options_out_of_range(kind, option):
-    with pytest.raises(FitError, match=f"^The option {next(iter(option))} is "):
+    with pytest.raises(FitError, match=rf"^The option {kind.__name__.lower()}\.{next(iter(option))} is "):
         kind(**option)

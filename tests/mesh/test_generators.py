@@ -1,14 +1,18 @@
 """Kuhn grids and Delaunay meshes: conforming, complete, positive."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as numbers
 from scipy.spatial import ConvexHull
 
 from difftetvr.errors import MeshError
 from difftetvr.mesh import TetMesh
+from difftetvr.mesh.generators import grid_with_shell, shell_has_room, without_pinches
 
 
 def lattice(n):
@@ -149,3 +153,70 @@ def test_delaunay_circumspheres_are_empty():
 def test_delaunay_errors(points, message):
     with pytest.raises(MeshError, match=message):
         TetMesh.delaunay(points)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    shape=st.tuples(*[st.integers(1, 8)] * 3),
+    layers=st.integers(1, 4),
+    growth=st.floats(1.01, 100.0),
+    sides=st.tuples(*[st.floats(0.1, 10.0)] * 3),
+)
+def test_a_grid_with_a_shell_fills_the_outer_box_with_valid_cells(shape, layers, growth, sides):
+    inner = torch.tensor([[-1.0, 2.0, 0.0]] * 2, dtype=torch.float64)
+    inner[1] += torch.tensor(sides, dtype=torch.float64)
+    if not shell_has_room(shape, layers, growth):
+        with pytest.raises(MeshError, match=r"layers around .* are thinner than these"):
+            grid_with_shell(shape, layers, inner.tolist(), growth)
+        return
+    vertices, tets = grid_with_shell(shape, layers, inner.tolist(), growth, torch.float64)
+    mesh = TetMesh(vertices, tets)
+    mesh.validate()
+    assert mesh.num_cells == 6 * math.prod(n + 2 * layers for n in shape)
+    middle, half = inner.mean(0), 0.5 * growth * (inner[1] - inner[0])
+    outer = torch.stack((middle - half, middle + half))
+    torch.testing.assert_close(mesh.volumes().sum(), (outer[1] - outer[0]).prod())
+    torch.testing.assert_close(mesh.bounds(), outer)
+    # The grid over the inner box is there as it would be alone.
+    alone = TetMesh.grid(shape, *inner.tolist(), dtype=torch.float64).vertices
+    distance = (alone[:, None] - vertices).abs().amax(2).amin(1)
+    assert float(distance.max()) < 1e-9
+
+
+def test_the_cubes_of_a_shell_grow():
+    vertices, _ = grid_with_shell((4, 4, 4), 3, [[-1] * 3, [1] * 3], 8.0)
+    on_axis = vertices[(vertices[:, 1:].abs() < 1e-6).all(1), 0].unique()
+    assert on_axis.tolist() == pytest.approx([-8, -4, -2, -1, -0.5, 0, 0.5, 1, 2, 4, 8], abs=1e-5)
+
+
+@settings(max_examples=60, deadline=None)
+@given(numbers.arrays(bool, numbers.array_shapes(min_dims=3, max_dims=3, max_side=6)))
+def test_solids_without_pinches_have_manifold_boundaries(keep):
+    filled = without_pinches(keep)
+    assert (filled >= keep).all() and without_pinches(filled).tolist() == filled.tolist()
+    assume(filled.any())
+    grid = TetMesh.grid(keep.shape[::-1])
+    tets = grid.tets[torch.from_numpy(filled.reshape(-1)).repeat_interleave(6)]
+    mesh, _ = TetMesh(grid.vertices, tets).without_unused_vertices()
+    faces = mesh.topology.boundary_faces.long()
+    ends = torch.cat((faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]])).sort(1).values
+    assert (torch.unique(ends, dim=0, return_counts=True)[1] == 2).all()
+    for vertex in faces.unique().tolist():
+        # The boundary around a vertex is one fan: its faces hang together by the edges at the vertex.
+        fan = faces[(faces == vertex).any(1)]
+        rim = [set(face) - {vertex} for face in fan.tolist()]
+        reached = rim.pop()
+        while joined := [edge for edge in rim if edge & reached]:
+            reached |= joined[0]
+            rim.remove(joined[0])
+        assert not rim
+
+
+def test_a_pinch_is_filled_and_nothing_else():
+    keep = np.zeros((4, 4, 4), dtype=bool)
+    keep[1, 1, 1] = keep[1, 2, 2] = True
+    filled = without_pinches(keep)
+    assert filled[1, 1:3, 1:3].all() and filled.sum() <= 12
+    solid = np.zeros((5, 5, 5), dtype=bool)
+    solid[1:4, 1:4, 1:3] = True
+    assert (without_pinches(solid) == solid).all()

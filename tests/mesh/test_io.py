@@ -131,7 +131,7 @@ def test_missing_arrays_are_answered_with_those_found(tmp_path):
 def test_other_volume_cells_are_refused(tmp_path):
     cube = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], dtype=float)
     write_points(tmp_path / "a.vtu", [("hexahedron", np.array([[0, 1, 3, 2, 4, 5, 7, 6]]))], points=cube)
-    with pytest.raises(MeshError, match=r"1 cells of type 'hexahedron'.*split=True"):
+    with pytest.raises(MeshError, match=r"1 cell of type 'hexahedron'.*split=True"):
         load(tmp_path / "a.vtu")
 
 

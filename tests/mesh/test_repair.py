@@ -185,7 +185,7 @@ def test_flat_cells_that_no_move_can_lift():
     corners = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0.5, 0.5, 1], [0.5, 0.5, -1]])
     cells = [[0, 1, 2, 4], [0, 2, 3, 4], [0, 1, 3, 5], [1, 2, 3, 5], [0, 1, 2, 3]]
     assert repair(corners, cells).report.lifted_cells == 1
-    with pytest.raises(MeshError, match="3 flat cells are left inside the mesh that moving one"):
+    with pytest.raises(MeshError, match="Moving a vertex cannot mend 3 flat cells inside the mesh"):
         repair(np.concatenate((corners, [[0.5, 0.25, 0.0]])), [*cells, [0, 1, 2, 6], [0, 1, 3, 6]])
 
 

@@ -159,7 +159,7 @@ def test_progress_tells_of_moves_and_refinements():
         display(status(iteration=3, moves=MoveTotals(50, 9000, 3, 2, 1), refinements=4, last_refinement=record))
     text = console.export_text()
     for expected in (
-        "1 moves refused",
+        "1 move refused",
         "refinement 4: -70 +80 vertices",
         "5 flips",
         "gain 2.0e-04 (predicted 3.0e-04)",

@@ -27,6 +27,7 @@ __all__ = [
     "VolumeCapture",
     "VolumeRenderer",
     "fibonacci_orbit",
+    "is_photo_source",
     "load_capture",
     "random_orbit",
 ]

@@ -10,6 +10,7 @@ from typing import Literal, get_args
 import torch
 
 from difftetvr.capture.capture_file import read_capture, write_capture
+from difftetvr.capture.hull import silhouettes
 from difftetvr.capture.packed import PackedImages
 from difftetvr.errors import CaptureError
 from difftetvr.render.camera import Camera
@@ -37,6 +38,8 @@ class Capture:
             then.
         test: (N,) bool, views that training never sees. At least one view must be left for training.
         bounds: (2, 3) float32 lower and upper corner of the box that holds the object, in world space.
+        surroundings: How many times as large a box around the same centre holds what is seen behind the object, too; 1
+            where nothing is.
         name: What to call the capture.
         density_unit: Typical density per world unit, a scale for optimisers; 0 stands for 25 / longest side of the box.
         encoding: Whether the images hold linear light (``linear``) or sRGB-encoded values (``srgb``).
@@ -60,6 +63,7 @@ class Capture:
     valid: torch.Tensor | None = None
     points: torch.Tensor | None = None
     point_colors: torch.Tensor | None = None
+    surroundings: float = 1.0
 
     def __post_init__(self) -> None:
         self._check_images()
@@ -71,6 +75,13 @@ class Capture:
             )
         if bool(self.test.all()):
             raise CaptureError(f"All views of '{self.name}' are held out for testing; leave some for training.")
+        self._check_bounds()
+        if not (math.isfinite(self.density_unit) and self.density_unit >= 0):
+            raise CaptureError(f"The density unit of '{self.name}' is {self.density_unit}; it must not be negative.")
+        if self.density_unit == 0:
+            self.density_unit = _DEFAULT_ATTENUATION / float((self.bounds[1] - self.bounds[0]).max())
+
+    def _check_bounds(self) -> None:
         self.bounds = torch.as_tensor(self.bounds, dtype=torch.float32)
         if self.bounds.shape != (2, 3) or not bool((self.bounds[0] < self.bounds[1]).all()):
             raise CaptureError(
@@ -78,10 +89,8 @@ class Capture:
             )
         if not bool(torch.isfinite(self.bounds).all()):
             raise CaptureError(f"The bounds of '{self.name}' are not finite; give the corners of a box.")
-        if not (math.isfinite(self.density_unit) and self.density_unit >= 0):
-            raise CaptureError(f"The density unit of '{self.name}' is {self.density_unit}; it must not be negative.")
-        if self.density_unit == 0:
-            self.density_unit = _DEFAULT_ATTENUATION / float((self.bounds[1] - self.bounds[0]).max())
+        if not (math.isfinite(self.surroundings) and self.surroundings >= 1.0):
+            raise CaptureError(f"The surroundings of '{self.name}' are {self.surroundings}; they must be at least 1.")
 
     def _check_images(self) -> None:
         shape = tuple(self.images.shape)
@@ -143,6 +152,36 @@ class Capture:
     def test_indices(self) -> torch.Tensor:
         """int64 indices of the held-out views."""
         return self.test.nonzero().flatten()
+
+    @property
+    def outer_bounds(self) -> torch.Tensor:
+        """(2, 3) float32 corners of the box of the surroundings."""
+        middle, half = self.bounds.mean(0), 0.5 * (self.bounds[1] - self.bounds[0])
+        return torch.stack((middle - self.surroundings * half, middle + self.surroundings * half))
+
+    def density_units_at(self, points: torch.Tensor) -> torch.Tensor:
+        """Typical densities at places, scales for optimisers.
+
+        Inside the bounds that is ``density_unit``. It falls as the distance from their centre grows, as what is farther
+        off is seen, and reconstructed, more coarsely.
+
+        Args:
+            points: (N, 3) positions in world space.
+
+        Returns:
+            (N,) densities per world unit, > 0, of the dtype and on the device of ``points``.
+        """
+        lower, upper = self.bounds.to(points)
+        distance = (2.0 * points - lower - upper).abs() / (upper - lower)
+        return self.density_unit / distance.amax(1).clamp_min(1.0)
+
+    def silhouettes(self) -> torch.Tensor | None:
+        """(N, H, W) bool, where the object may be seen: where alpha is not 0, or inside of a black border.
+
+        Returns:
+            The masks, or None where nothing tells the object from its background.
+        """
+        return silhouettes(self.images, self.alphas)
 
     def save(self, path: str | Path) -> None:
         """Write the capture to one ``.npz`` file, which :meth:`load` reads back to the bit.

@@ -18,8 +18,8 @@ from difftetvr.render.camera import Camera
 if TYPE_CHECKING:
     from difftetvr.capture.capture import Capture
 
-# Version 1 knew no encoding (all was linear), no bytes, no points and no masks.
-_VERSION = 2
+# Version 1 knew no encoding (all was linear), no bytes, no points and no masks, version 2 no surroundings.
+_VERSION = 3
 _NEEDED = ("version", "images", "test", "bounds", "name", "density_unit", "world_to_camera", "intrinsics")
 _OPTIONAL = ("alphas", "valid", "points", "point_colors")
 _DAMAGE = (
@@ -53,6 +53,7 @@ def write_capture(capture: Capture, path: str | Path) -> None:
         "world_to_camera": torch.stack([c.world_to_camera.detach().cpu() for c in cameras]).numpy(),
         "intrinsics": np.array([(c.fx, c.fy, c.cx, c.cy) for c in cameras]),
         "encoding": np.array(capture.encoding),
+        "surroundings": np.array(capture.surroundings),
     }
     for key in _OPTIONAL:
         value = getattr(capture, key)
@@ -88,6 +89,7 @@ def read_capture(path: str | Path) -> dict[str, Any]:
             "name": str(content["name"]),
             "density_unit": float(content["density_unit"]),
             "encoding": str(content.get("encoding", "linear")),
+            "surroundings": float(content.get("surroundings", 1.0)),
             **{key: _packed_if_bytes(key, tensor) for key, tensor in tensors.items()},
         }
     except CameraError as error:

@@ -21,6 +21,7 @@ from difftetvr.errors import CameraError, CaptureError
 from difftetvr.render.camera import Camera
 
 _MOST_WORKERS = 8
+_MOST_DOWNSCALE = 64  # of the smaller copies that are looked for
 # Sides that differ by less are cropped: COLMAP's undistorter gives every image a size of its own.
 _CROPPED_SHARE, _CROPPED_PIXELS = 0.01, 2
 
@@ -121,6 +122,28 @@ def present_views(photo_set: PhotoSet, downscale: int) -> list[View]:
         stacklevel=2,
     )
     return [view for view in views if view not in absent]
+
+
+def fitting_downscale(photo_set: PhotoSet, longest_side: int) -> int:
+    """The least downscale with which the first image there is has at most so many pixels along its longer side.
+
+    Args:
+        photo_set: What a reader found.
+        longest_side: Pixels, >= 1.
+
+    Raises:
+        CaptureError: The image cannot be read.
+    """
+    for view in photo_set.views:
+        for downscale in range(1, _MOST_DOWNSCALE + 1):
+            found = view.file(downscale)
+            if found is None:
+                continue
+            file, factor = found
+            least = -(-factor * max(image_size(file)) // longest_side)
+            # Smaller copies may be all there is, and only serve multiples of their factor.
+            return downscale * max(1, -(-least // downscale))
+    return 1
 
 
 def make_camera(intrinsics: Intrinsics, pose: torch.Tensor, where: str) -> Camera:

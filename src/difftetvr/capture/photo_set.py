@@ -70,7 +70,7 @@ class PhotoSet:
         points: (P, 3) float64 points on the scene's surfaces, None where none are known.
         point_colors: (P, 3) float64 colours of the points in [0, 1], encoded as the images are.
         bounds: (2, 3) float64 corners of the object's box, where the format gives it.
-        outer_bounds: (2, 3) float64 corners of a generous box, for scenes that nothing better is known of.
+        rough_bounds: (2, 3) float64 corners of a box that should hold the object, where nothing better is known.
     """
 
     name: str
@@ -80,7 +80,7 @@ class PhotoSet:
     points: np.ndarray | None = None
     point_colors: np.ndarray | None = None
     bounds: np.ndarray | None = None
-    outer_bounds: np.ndarray | None = None
+    rough_bounds: np.ndarray | None = None
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -9,12 +9,13 @@ from typing import Literal, get_args
 import numpy as np
 import torch
 
-from difftetvr.capture.bounds import hull_bounds, point_bounds, require_seen, silhouettes
+from difftetvr.capture.bounds import hull_bounds, point_bounds, require_seen, surroundings_of
 from difftetvr.capture.camera_list import CAMERAS_FORMAT, read_camera_list
 from difftetvr.capture.capture import Capture
 from difftetvr.capture.colmap import find_colmap_model, read_colmap
+from difftetvr.capture.hull import silhouettes
 from difftetvr.capture.packed import PackedImages
-from difftetvr.capture.photo_load import load_photos, make_camera, present_views
+from difftetvr.capture.photo_load import fitting_downscale, load_photos, make_camera, present_views
 from difftetvr.capture.photo_set import PhotoSet, read_json
 from difftetvr.capture.tiny_nerf import is_tiny_nerf, read_tiny_nerf
 from difftetvr.capture.transforms import read_nerf_synthetic, read_transforms
@@ -54,6 +55,21 @@ class PhotoCapture:
     test_every: int | None = None
     bounds: tuple[float, float, float, float, float, float] | None = None
 
+    def fitting_downscale(self, longest_side: int) -> int:
+        """The least ``downscale`` with which images have at most so many pixels along their longer side, or nearly so.
+
+        Args:
+            longest_side: Pixels, >= 1.
+
+        Raises:
+            CaptureError: There is no such capture, or its first image cannot be read.
+        """
+        self._check()
+        path = Path(self.path)
+        kind = self.format or find_format(path)
+        # Archives of tiny NeRFs are tiny.
+        return 1 if kind == "tiny-nerf" else fitting_downscale(self._read(kind, path), longest_side)
+
     def build(self) -> Capture:
         """Read cameras and images.
 
@@ -65,14 +81,12 @@ class PhotoCapture:
         kind = self.format or find_format(path)
         if kind == "tiny-nerf":
             return self._build_tiny_nerf(path)
-        if not path.exists():
-            raise CaptureError(f"There is no '{path}'; check the path of the capture.")
-        photo_set = _READERS[kind](path)
+        photo_set = self._read(kind, path)
         photo_set.views = present_views(photo_set, self.downscale)
         given = torch.tensor([view.is_test for view in photo_set.views]) if photo_set.has_split else None
         test = self._test_mask(given, len(photo_set.views), photo_set.name)
         photos = load_photos(photo_set, self.downscale)
-        bounds = self._find_bounds(photo_set, photos.cameras, photos.images, photos.alphas, test)
+        bounds, surroundings = self._find_bounds(photo_set, photos.cameras, photos.images, photos.alphas, test)
         return Capture(
             photos.cameras,
             photos.images,
@@ -84,7 +98,14 @@ class PhotoCapture:
             valid=photos.valid,
             points=_tensor(photo_set.points),
             point_colors=_tensor(photo_set.point_colors),
+            surroundings=surroundings,
         )
+
+    @staticmethod
+    def _read(kind: PhotoFormat, path: Path) -> PhotoSet:
+        if not path.exists():
+            raise CaptureError(f"There is no '{path}'; check the path of the capture.")
+        return _READERS[kind](path)
 
     def _build_tiny_nerf(self, path: Path) -> Capture:
         content = read_tiny_nerf(path, self.downscale)
@@ -93,8 +114,17 @@ class PhotoCapture:
             for index, pose in enumerate(content.poses)
         ]
         test = self._test_mask(None, len(cameras), path.stem)
-        bounds = self._find_bounds(PhotoSet(path.stem), cameras, content.images, content.alphas, test)
-        return Capture(cameras, content.images, content.alphas, test, bounds, path.stem, encoding="srgb")
+        bounds, surroundings = self._find_bounds(PhotoSet(path.stem), cameras, content.images, content.alphas, test)
+        return Capture(
+            cameras,
+            content.images,
+            content.alphas,
+            test,
+            bounds,
+            path.stem,
+            encoding="srgb",
+            surroundings=surroundings,
+        )
 
     def _check(self) -> None:
         if self.format is not None and self.format not in get_args(PhotoFormat):
@@ -121,25 +151,28 @@ class PhotoCapture:
         images: torch.Tensor | PackedImages,
         alphas: torch.Tensor | PackedImages | None,
         test: torch.Tensor,
-    ) -> torch.Tensor:
-        """(2, 3) float32 box; of images only those for training are looked at."""
+    ) -> tuple[torch.Tensor, float]:
+        """(2, 3) float32 bounds, and the surroundings' factor; only images for training are looked at."""
         train = (~test).nonzero().flatten().tolist() or list(range(len(cameras)))
         seeing = [cameras[view] for view in train]
+        masks = silhouettes(images, alphas)
         if self.bounds is not None:
             box = np.array(self.bounds, dtype=np.float64).reshape(2, 3)
         elif photo_set.bounds is not None:
             box = photo_set.bounds
-        elif (masks := silhouettes(images, alphas)) is not None:
+        elif masks is not None:
             box = hull_bounds(seeing, masks[train])
         elif photo_set.points is not None:
             box = point_bounds(photo_set.points, seeing)
-        elif photo_set.outer_bounds is not None:
-            box = photo_set.outer_bounds
+        elif photo_set.rough_bounds is not None:
+            box = photo_set.rough_bounds
         else:
             box = hull_bounds(seeing, None)
+        surroundings = 1.0
         if np.isfinite(box).all() and (box[0] < box[1]).all():
             require_seen(box, seeing, photo_set.name)
-        return torch.from_numpy(box.astype(np.float32))
+            surroundings = 1.0 if masks is not None else surroundings_of(box, seeing)
+        return torch.from_numpy(box.astype(np.float32)), surroundings
 
 
 def is_photo_source(source: str | Path) -> bool:

@@ -57,8 +57,8 @@ def read_transforms(path: Path) -> PhotoSet:
 
     Intrinsics may stand at the top or, overriding that, in each frame. Distortion is OpenCV's k1, k2, p1, p2, k3.
     nerfstudio's lists of ``train_filenames`` and ``test_filenames`` (or ``val_filenames``) are kept to.
-    instant-ngp's ``aabb_scale`` gives the bounds, with its ``scale`` and ``offset``. Listed images may be absent, as
-    instant-ngp allows.
+    Where there is an ``aabb_scale``, the bounds are instant-ngp's unit cube, by its ``scale`` and ``offset``.
+    Listed images may be absent, as instant-ngp allows.
 
     Args:
         path: The file, or its folder.
@@ -79,7 +79,7 @@ def read_transforms(path: Path) -> PhotoSet:
     if not views:
         raise CaptureError(f"The file names that '{file}' lists for training and testing are none of its frames.")
     name = folder.resolve().name
-    return PhotoSet(name, views, has_split=bool(held_out), may_miss=True, outer_bounds=_box(content, f"'{file}'"))
+    return PhotoSet(name, views, has_split=bool(held_out), may_miss=True, rough_bounds=_box(content, f"'{file}'"))
 
 
 def _held_out(folder: Path) -> list[View]:
@@ -142,7 +142,7 @@ def _lens(values: dict[str, Any], where: str) -> Lens:
 
 
 def _box(content: dict[str, Any], where: str) -> np.ndarray | None:
-    """The box of instant-ngp, None where the file gives none."""
+    """The unit cube of instant-ngp, where the object should be; None where the file is not for instant-ngp."""
     side = number_of(content, "aabb_scale", where)
     if side is None:
         return None
@@ -155,7 +155,7 @@ def _box(content: dict[str, Any], where: str) -> np.ndarray | None:
     if side <= 0 or not np.isfinite(offsets).all():
         raise CaptureError(f"The aabb_scale {side:g} or the offset {offset!r} of {where} is not valid; correct them.")
     center = (_NGP_CENTER - offsets) / scale
-    half = 0.5 * side / abs(scale)
+    half = 0.5 / abs(scale)
     return np.stack([center - half, center + half])
 
 

@@ -44,9 +44,7 @@ def main(args: Sequence[str] | None = None) -> int:
     """
     given = list(sys.argv[1:] if args is None else args)
     try:
-        command: Any = parse(Command, given)
-        if isinstance(command, Fit):
-            command = command.with_saved_options(given[1:])
+        command: Any = parse(Command, given, Fit.defaults(given[1:]) if given[:1] == ["fit"] else None)
         command.run(console())
     except SystemExit as leave:
         return leave.code if isinstance(leave.code, int) else _USAGE_ERROR

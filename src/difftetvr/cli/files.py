@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from difftetvr.cli.options import CaptureOptions, MeshOptions, load_model
-from difftetvr.errors import MeshError
+from difftetvr.errors import MeshError, counted
 from difftetvr.files import require_writable
 from difftetvr.fit.errors import FitError
 from difftetvr.fit.folder import write_json
@@ -111,7 +111,7 @@ class Export:
         left_out = sorted({*data.point_data, *data.cell_data}.difference(written))
         content = " and ".join(written) or "geometry only"
         without = f", without {', '.join(left_out)}" if left_out else ""
-        console.print(f"Wrote {self.output} ({data.mesh.num_cells:,} cells, {content}{without})")
+        console.print(f"Wrote {self.output} ({counted(data.mesh.num_cells, 'cell')}, {content}{without})")
 
 
 def _is_capture(path: Path) -> bool:

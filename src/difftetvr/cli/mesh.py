@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from tyro.conf import Positional, arg
 
 from difftetvr.cli.options import Output
-from difftetvr.errors import MeshError
+from difftetvr.errors import MeshError, counted
 from difftetvr.files import require_writable
 from difftetvr.terminal import waiting
 
@@ -61,7 +61,7 @@ class Mesh:
         with waiting(console, f"Meshing {self.source or 'the box'}"):
             mesh = self._of_box(self.box) if self.box else self._of_file(self.source or Path(), console)
         save(self.output, mesh)
-        console.print(f"Wrote {self.output} ({mesh.num_cells:,} cells, {mesh.num_vertices:,} vertices)")
+        console.print(f"Wrote {self.output} ({counted(mesh.num_cells, 'cell')}, {mesh.num_vertices:,} vertices)")
 
     def _require_consistent(self) -> None:
         if (self.source is None) == (self.box is None):
@@ -75,7 +75,7 @@ class Mesh:
             )
 
     def _of_box(self, box: tuple[float, ...]) -> TetMesh:
-        from difftetvr.fit.config import grid_cubes
+        from difftetvr.mesh.generators import grid_cubes
         from difftetvr.mesh.surfaces import MesherOptions, tetrahedralize_box
         from difftetvr.mesh.tetmesh import TetMesh
 

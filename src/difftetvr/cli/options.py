@@ -32,7 +32,8 @@ class CaptureOptions:
     format: Literal["nerf-synthetic", "transforms", "colmap", "cameras", "tiny-nerf"] | None = None
     """What a folder of photos is; default: found by looking."""
     downscale: int | None = None
-    """Pixels of a photo along x and y that are averaged to one."""
+    """Pixels of a photo along x and y that are averaged to one; default: 1, for fit so many that the longer side has at
+    most 400 pixels, on CUDA 1600."""
     bounds: tuple[float, float, float, float, float, float] | None = None
     """Box to reconstruct from photos, its lower and its upper corner; default: found."""
 
@@ -58,6 +59,23 @@ class CaptureOptions:
     """Cameras on a spiral over the sphere, or at random places of it."""
     test_every: int | None = None
     """One of so many views is held out; 0: none."""
+
+    def fitting(self, name: str, longest_side: int) -> CaptureOptions:
+        """These options; where they leave the size of photographs open, with one that suits.
+
+        Args:
+            name: Of the capture.
+            longest_side: Pixels that photographs should have at most along their longer side.
+        """
+        from difftetvr.capture import CaptureWarning, PhotoCapture, is_photo_source
+
+        if self.downscale is not None or not (self.format or is_photo_source(name)):
+            return self
+        with warnings.catch_warnings():
+            # They are said when the images are read.
+            warnings.simplefilter("ignore", CaptureWarning)
+            downscale = PhotoCapture(name, self.format).fitting_downscale(longest_side)
+        return dataclasses.replace(self, downscale=downscale) if downscale > 1 else self
 
     def load(self, name: str, console: Console) -> Capture:
         """Reads or renders the capture of that name."""
@@ -115,6 +133,15 @@ def load_model(
     return data.mesh.to(device=target), data.field.to(device=target)
 
 
-def parse(command: Any, args: Sequence[str], default: Any = tyro.MISSING) -> Any:
-    """A command from arguments; options that are not given keep the values of ``default``."""
-    return tyro.cli(command, prog="difftetvr", args=args, default=default, config=(FlagCreatePairsOff,))
+def parse(command: Any, args: Sequence[str], default: Any = None) -> Any:
+    """A command from arguments.
+
+    Args:
+        command: Its type, or a union of such types.
+        args: The arguments.
+        default: Holds the values of options that are not given, ``tyro.MISSING`` where they must be; None: as declared.
+    """
+    if default is None:
+        return tyro.cli(command, prog="difftetvr", args=args, config=(FlagCreatePairsOff,))
+    # With pairs (--move, --no-move): such a default may stand either way, and the arguments must be able to turn it.
+    return tyro.cli(command, prog="difftetvr", args=args, default=default)

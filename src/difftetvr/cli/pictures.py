@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from difftetvr.cli.options import CaptureOptions, Output, load_model
-from difftetvr.errors import CaptureError
+from difftetvr.errors import CaptureError, counted
 from difftetvr.files import require_writable
 
 if TYPE_CHECKING:
@@ -51,7 +51,8 @@ class Compare:
         if not self.models:
             raise CaptureError("There is no model to compare with; name one or more after the capture.")
         if self.names and len(self.names) != len(self.models):
-            raise CaptureError(f"There are {len(self.models)} models but {len(self.names)} --names; give one for each.")
+            count = counted(len(self.models), "model")
+            raise CaptureError(f"The picture is to show {count} but {len(self.names)} --names; give one for each.")
         names = self.names or tuple(path.stem for path in self.models)
         models = [Model(name, *load_model(path, self.device)) for name, path in zip(names, self.models, strict=True)]
         capture = self.views_of.load(self.capture, console)

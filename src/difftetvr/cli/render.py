@@ -12,7 +12,7 @@ import torch
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from difftetvr.cli.options import MeshOptions, Output
-from difftetvr.errors import CameraError, CaptureError, MeshError
+from difftetvr.errors import CameraError, CaptureError, MeshError, counted
 from difftetvr.files import require_writable
 
 if TYPE_CHECKING:
@@ -163,7 +163,7 @@ class Render:
             values = statistics.depth_complexity.float()
             most, mean = int(values.max()), float(values.mean())
             save_heatmap(self.output, values, Scale("cells crossed", 0.0, max(most, 1)))
-            found = f"up to {most:,} cells a ray, {mean:.1f} on average"
+            found = f"up to {counted(most, 'cell')} a ray, {mean:.1f} on average"
         else:
             values = statistics.worst_quality
             save_heatmap(self.output, values, Scale("worst quality Q", _WORST_SHOWN, 1.0, is_logarithmic=True))

@@ -26,7 +26,7 @@ from difftetvr.fit.errors import FitError
 from difftetvr.fit.history import History
 from difftetvr.mesh.tetmesh import TetMesh
 
-_VERSION = 3
+_VERSION = 4
 _HISTORY = ("history.loss", "history.psnr")
 
 
@@ -171,7 +171,7 @@ def _checkpoint(state: dict[str, Any], tensors: dict[str, torch.Tensor], source:
     history = History.from_events(loss, psnr, state)
     config = FitConfig.from_json(state["config"])
     iteration, capture = state["iteration"], state["capture"]
-    if not isinstance(iteration, int) or not iteration == len(loss) == len(psnr) <= config.iterations:
+    if not isinstance(iteration, int) or not iteration == len(loss) == len(psnr) <= config.steps:
         raise ValueError(f"its history has {len(loss)} losses after {iteration} iterations")
     if not isinstance(capture, dict):
         raise TypeError("it does not describe its images")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -15,6 +14,7 @@ from difftetvr.fit.options import LARGEST_COUNT, options_from_json, require
 from difftetvr.fit.positions import VertexOptimizerConfig
 from difftetvr.fit.refinement import Exchange, Grow, Star, Strategy
 from difftetvr.mesh.faces import MAX_CELLS
+from difftetvr.mesh.generators import CELLS_PER_CUBE
 from difftetvr.mesh.harmonics import MAX_DEGREE
 
 if TYPE_CHECKING:
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
 Background = Literal["black", "white", "random"] | tuple[float, float, float]
 
-_CELLS_PER_CUBE = 6
 # Independent streams of random numbers.
 _VIEW_STREAM, _BACKGROUND_STREAM, _REFINEMENT_STREAM = range(3)
 _BACKGROUND_COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
@@ -36,10 +35,21 @@ _RANGES = {
 }
 _LOSSES = ("l2", "l1", "l1-ssim")
 _BACKGROUNDS = ("black", "white", "random")
-_PHOTO_BANDS = 2
+_STARTS = ("grid", "hull", "points")
+_DEFAULT_CELLS, _DEFAULT_ITERATIONS = 20_000, 2400
+_PHOTO_BANDS, _PHOTO_ITERATIONS = 2, 4800
+_PHOTO_PIXELS_PER_CELL = 12
+_MOST_PHOTO_CELLS = 1_000_000
 _BAND_SHARE = 0.05  # of the run, from one band of harmonics to the next
 _STRATEGIES = ("exchange", "grow", "star", "none")
-CHOSEN_FOR_CAPTURE = ("background", "harmonics")
+_CHOICES_FOR_VOLUMES: dict[str, Any] = {
+    "cells": _DEFAULT_CELLS,
+    "start": "grid",
+    "iterations": _DEFAULT_ITERATIONS,
+    "background": "black",
+    "harmonics": 0,
+}
+CHOSEN_FOR_CAPTURE = tuple(_CHOICES_FOR_VOLUMES)
 """Options whose default depends on the images."""
 
 # Options that change nothing about where the optimisation goes: a resumed run may choose them anew.
@@ -50,6 +60,8 @@ _FREE_OPTIONS = frozenset({"device", "evaluate_every", "checkpoint_seconds"})
 class Motion(VertexOptimizerConfig):
     """How vertices move in a run; unlike `VertexOptimizer` alone, it lets those on the boundary slide by default."""
 
+    prefix = "motion."
+
     boundary: Literal["fixed", "slide"] = "slide"
     """Whether vertices on the boundary stay, or slide in their plane or along their crease."""
     every: int = 2
@@ -59,8 +71,8 @@ class Motion(VertexOptimizerConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(1 <= self.every <= LARGEST_COUNT, "every", self.every, f"at least 1 and at most {LARGEST_COUNT}")
-        require(0 < self.until <= 1, "until", self.until, "greater than 0 and at most 1")
+        self._require(1 <= self.every <= LARGEST_COUNT, "every", f"at least 1 and at most {LARGEST_COUNT}")
+        self._require(0 < self.until <= 1, "until", "greater than 0 and at most 1")
 
 
 @dataclass(frozen=True)
@@ -73,11 +85,15 @@ class FitConfig:
     Unlike the image of an exponential or a softplus, that range includes 0, so empty space becomes exactly empty.
     """
 
-    cells: int = 20_000
-    """Budget of tetrahedra. The run begins with the grid of near-cubic cubes over the capture's bounds that is nearest
-    to it, and refinement ends within it."""
+    cells: int | None = None
+    """Budget of tetrahedra: the run begins with about as many, and refinement ends within it. Default: 20 000; for
+    photographs one for every 12 pixels to learn from, up to a million."""
+    start: Literal["grid", "hull", "points"] | None = None
+    """Mesh to begin with: a grid of near-cubic cubes over the capture's bounds, those of them that no silhouette rules
+    out, or the Delaunay mesh of its sparse points and a coarse lattice. Around the bounds of captures without
+    silhouettes comes a shell of growing cells. Default: hull for photographs with silhouettes, else grid."""
     grid: tuple[int, int, int] | None = None
-    """Cubes of that grid along x, y and z, 6 tetrahedra each; overrides --cells, unless the mesh is to grow."""
+    """Cubes of the grid along x, y and z, 6 tetrahedra each; overrides --cells, unless the mesh is to grow."""
     initial_mesh: str | None = None
     """Mesh file to begin with instead of a grid; its colours and densities, if it has any, are the initial ones. It is
     its own budget; only where it is to grow does --cells say how far."""
@@ -90,8 +106,8 @@ class FitConfig:
     the article, or not at all."""
     location: Literal["vertex", "cell"] = "vertex"
     """Whether colour and density belong to vertices, linear in between, or to cells, constant inside."""
-    iterations: int = 2400
-    """Number of optimisation steps."""
+    iterations: int | None = None
+    """Number of optimisation steps; default: 4800 for photographs, else 2400."""
     batch_views: int = 1
     """Training views per step; their gradients are averaged."""
     loss: Literal["l2", "l1", "l1-ssim"] = "l2"
@@ -99,7 +115,7 @@ class FitConfig:
     harmonics: int | None = None
     """Bands of spherical harmonics, from 0 to 3, by which colours depend on the direction; default: 2 for photographs,
     else 0."""
-    harmonics_rate: float = 0.5
+    harmonics_rate: float = 0.2
     """Learning rate of their coefficients, in units of that of colours."""
     rate: float = 0.03
     """Learning rate of the first step."""
@@ -141,7 +157,7 @@ class FitConfig:
     def __post_init__(self) -> None:
         for name, (least, most) in _RANGES.items():
             value = getattr(self, name)
-            require(least <= value <= most, name, value, f"at least {least} and at most {most}")
+            require(value is None or least <= value <= most, name, value, f"at least {least} and at most {most}")
         for name in ("rate", "final_rate", "harmonics_rate"):
             require(_positive(getattr(self, name)), name, getattr(self, name), "greater than 0 and finite")
         for name in ("haze_penalty", "sparsity", "initial_density", "checkpoint_seconds"):
@@ -156,15 +172,27 @@ class FitConfig:
         require(self.refine in _STRATEGIES, "refine", self.refine, f"one of {', '.join(_STRATEGIES)}")
         on_cells = self.location == "cell" and self.refine != "none"
         require(not on_cells, "refine", self.refine, "none where colours belong to cells (location cell)")
+        require(self.start in (None, *_STARTS), "start", self.start, f"one of {', '.join(_STARTS)}")
         if self.grid is not None:
+            require(self.start != "points", "grid", self.grid, "left out where the mesh starts from points")
             require(min(self.grid) >= 1, "grid", self.grid, "at least 1 cube along each axis")
-            fits = math.prod(self.grid) <= MAX_CELLS // _CELLS_PER_CUBE
-            require(fits, "grid", self.grid, f"at most {MAX_CELLS // _CELLS_PER_CUBE} cubes in all")
+            fits = math.prod(self.grid) <= MAX_CELLS // CELLS_PER_CUBE
+            require(fits, "grid", self.grid, f"at most {MAX_CELLS // CELLS_PER_CUBE} cubes in all")
         require(self.initial_mesh is None or self.grid is None, "grid", self.grid, "left out with an initial mesh")
         require(self.initial_mesh is not None or not self.repair, "repair", self.repair, "given with an initial mesh")
         named = self.background is None or isinstance(self.background, str)
         valid = self.background in (None, *_BACKGROUNDS) if named else _is_color(self.background)
         require(valid, "background", self.background, "black, white, random or three values in [0, 1]")
+
+    @property
+    def budget(self) -> int:
+        """Cells that the mesh may have, where the options do not leave it open."""
+        return self.cells or _DEFAULT_CELLS
+
+    @property
+    def steps(self) -> int:
+        """Number of optimisation steps, where the options do not leave it open."""
+        return self.iterations or _DEFAULT_ITERATIONS
 
     @property
     def needs_alpha(self) -> bool:
@@ -177,17 +205,13 @@ class FitConfig:
         Args:
             capture: Images and cameras.
         """
-        is_photo = capture.encoding == "srgb"
-        background: Background = "random" if is_photo and capture.alphas is not None else "black"
-        return dataclasses.replace(
-            self,
-            background=background if self.background is None else self.background,
-            harmonics=(_PHOTO_BANDS if is_photo else 0) if self.harmonics is None else self.harmonics,
-        )
+        choices = _choices_for_photos(capture) if capture.encoding == "srgb" else _CHOICES_FOR_VOLUMES
+        left_open = {name: choices[name] for name in CHOSEN_FOR_CAPTURE if getattr(self, name) is None}
+        return dataclasses.replace(self, **left_open)
 
     def bands_at(self, iteration: int) -> int:
         """Bands of the harmonics that take part in a step: they are switched on one after the other."""
-        return min(self.harmonics or 0, int(iteration / (_BAND_SHARE * self.iterations)))
+        return min(self.harmonics or 0, int(iteration / (_BAND_SHARE * self.steps)))
 
     def strategy(self) -> Strategy | None:
         """How the mesh is refined; None if it is not."""
@@ -195,7 +219,7 @@ class FitConfig:
 
     def motion_rate_at(self, iteration: int) -> float | None:
         """Length of the vertices' steps, in altitudes; None where they stay."""
-        progress = iteration / (self.motion.until * self.iterations)
+        progress = iteration / (self.motion.until * self.steps)
         return self.motion.rate_at(progress) if self.move and progress < 1.0 else None
 
     def refinement_views_at(self, iteration: int, count: int, view_count: int) -> list[int]:
@@ -211,7 +235,7 @@ class FitConfig:
 
     def rate_at(self, iteration: int) -> float:
         """Learning rate of a step, log-linear from ``rate`` (iteration 0) to ``final_rate`` (the last one)."""
-        fraction = iteration / max(self.iterations - 1, 1)
+        fraction = iteration / max(self.steps - 1, 1)
         return self.rate * (self.final_rate / self.rate) ** fraction
 
     def views_at(self, iteration: int, view_count: int) -> list[int]:
@@ -268,25 +292,15 @@ class FitConfig:
         return int(np.random.default_rng([self.seed, _VIEW_STREAM, epoch]).permutation(view_count)[offset])
 
 
-def grid_cubes(cells: int, extent: Sequence[float]) -> tuple[int, int, int]:
-    """Cubes along each axis of the Kuhn grid whose number of tetrahedra is nearest to a budget.
-
-    Only grids whose boxes are nearly cubes compete: those that come from dividing each side of the box by one edge
-    length and rounding.
-
-    Args:
-        cells: Budget of tetrahedra, >= 1.
-        extent: (3,) sides of the box, in any unit, > 0.
-    """
-    sides = np.asarray(extent, dtype=np.float64)
-    edge = (sides.prod() * _CELLS_PER_CUBE / cells) ** (1 / 3)
-    edges = edge * np.exp(np.linspace(-0.5, 0.5, 2001))
-    candidates = np.maximum(1, np.rint(sides / edges[:, None])).astype(np.int64)
-    error = np.abs(candidates.prod(axis=1) * _CELLS_PER_CUBE - cells)
-    # Among equals the one whose edge is closest to that of exact cubes.
-    best = np.lexsort((np.abs(np.log(edges / edge)), error))[0]
-    nx, ny, nz = (int(n) for n in candidates[best])
-    return nx, ny, nz
+def _choices_for_photos(capture: Capture) -> dict[str, Any]:
+    pixels = len(capture.train_indices) * math.prod(capture.images.shape[1:3])
+    return {
+        "cells": max(_DEFAULT_CELLS, min(pixels // _PHOTO_PIXELS_PER_CELL, _MOST_PHOTO_CELLS)),
+        "start": "grid" if capture.silhouettes() is None else "hull",
+        "iterations": _PHOTO_ITERATIONS,
+        "background": "black" if capture.alphas is None else "random",
+        "harmonics": _PHOTO_BANDS,
+    }
 
 
 def _positive(value: float) -> bool:

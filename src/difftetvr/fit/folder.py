@@ -121,22 +121,6 @@ class RunFolder:
                 self._withdraw(absent)
             raise
 
-    def read_config(self) -> dict[str, Any] | None:
-        """Options of the run in the folder, None if it holds none.
-
-        Raises:
-            FitError: The file is damaged.
-        """
-        if not self.config.is_file():
-            return None
-        try:
-            options = json.loads(self.config.read_text())
-        except (OSError, ValueError) as error:
-            raise FitError(f"{self.config} cannot be read ({error}); start anew with --overwrite.") from error
-        if not isinstance(options, dict):
-            raise FitError(f"{self.config} holds no options; start anew with --overwrite.")
-        return options
-
     def _clear(self) -> None:
         # The checkpoint goes first and the options last: cut short, this never leaves a state to resume from without
         # the options that it belongs to.

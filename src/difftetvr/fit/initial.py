@@ -48,10 +48,10 @@ def load_start(capture: Capture, config: FitConfig, strategy: Strategy | None) -
     path = Path(config.initial_mesh or "")
     start = _load_repaired(path) if config.repair else _load_valid(path)
     _require_overlap(path, start.mesh, capture)
-    if strategy is not None and strategy.initial_cells(config.cells) < config.cells < start.mesh.num_cells:
+    if strategy is not None and strategy.initial_cells(config.budget) < config.budget < start.mesh.num_cells:
         raise FitError(
-            f"{path} has {start.mesh.num_cells:,} cells, more than the {config.cells:,} that it may grow to; give more "
-            "with --cells, or do not let it grow (--refine exchange or none)."
+            f"{path} has {start.mesh.num_cells:,} cells, more than the {config.budget:,} that it may grow to; give "
+            "more with --cells, or do not let it grow (--refine exchange or none)."
         )
     _require_usable(path, start, config)
     return start

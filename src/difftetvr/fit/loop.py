@@ -116,16 +116,16 @@ def optimise(
 def _run(trainer: Trainer, path: Path | None, on_progress: Callable[[Progress], None] | None) -> None:
     """Iterates to the end, with glances and checkpoints on the way."""
     config, history = trainer.config, trainer.history
-    if path is not None and trainer.iteration < config.iterations:
+    if path is not None and trainer.iteration < config.steps:
         # A full disk or a forbidden folder is found before the work, not with its result.
         require_no_folder(path)
         trainer.checkpoint().save(path)
     start = time.perf_counter() - history.seconds
     saved = time.perf_counter()
     with InterruptFlag(active=path is not None) as interrupt:
-        while trainer.iteration < config.iterations and not interrupt.raised:
+        while trainer.iteration < config.steps and not interrupt.raised:
             trainer.step()
-            last = trainer.iteration == config.iterations
+            last = trainer.iteration == config.steps
             if config.evaluate_every and (trainer.iteration % config.evaluate_every == 0 or last):
                 trainer.glance()
             history.seconds = time.perf_counter() - start

@@ -28,28 +28,30 @@ class FieldParameters:
         color: (N, 3) leaf tensor, linear RGB; N vertices or cells.
         density: (N,) leaf tensor in units of ``density_unit``.
         harmonics: (N, B, 3) leaf tensor, coefficients of the directional part of the colours; None without it.
-        density_unit: Density per unit length that a parameter of 1 stands for.
+        density_unit: (N,) densities per unit length that parameters of 1 stand for.
         location: ``"vertex"`` or ``"cell"``, what the N entries belong to.
     """
 
-    def __init__(self, mesh: TetMesh, config: FitConfig, density_unit: float, initial: Field | None = None) -> None:
+    def __init__(
+        self, mesh: TetMesh, config: FitConfig, density_unit: torch.Tensor, initial: Field | None = None
+    ) -> None:
         """Values before the first step.
 
         Args:
             mesh: What they are values on.
             config: Options, chosen for the capture.
-            density_unit: Density per unit length that a parameter of 1 stands for.
+            density_unit: (N,) densities per unit length that parameters of 1 stand for.
             initial: Field to begin with, at the location of the options; default: the options' initial values.
         """
         count = mesh.num_vertices if config.location == "vertex" else mesh.num_cells
         device = mesh.vertices.device
         self.location = config.location
-        self.density_unit = density_unit
+        self.density_unit = density_unit.to(device, torch.float32)
         color = torch.full((count, 3), config.initial_color, device=device)
         density = torch.full((count,), config.initial_density, device=device)
         if initial is not None:
             color.copy_(initial.color.detach())
-            density.copy_(initial.density.detach().double() / density_unit)
+            density.copy_(initial.density.detach().double() / self.density_unit)
         bands = COUNTS[config.harmonics or 0]
         harmonics = torch.zeros(count, bands, 3, device=device) if bands else None
         if harmonics is not None and initial is not None and initial.harmonics is not None:
@@ -97,13 +99,18 @@ class FieldParameters:
         Args:
             change: What was done to the mesh.
         """
+        unit = change.carry(self.density_unit)
+        # Where units differ, densities are what is linear along edges.
+        density = change.carry(self.density_unit * self.density.detach()) / unit
+        self.density_unit = unit
         for name, parameter in list(self._items()):
             state = self._optimizer.state.pop(parameter)
             first = change.carry(state[_FIRST])
             is_new = change.is_new.view(-1, *[1] * (first.ndim - 1))
             state[_FIRST] = torch.where(is_new, 0.0, first)
             state[_SECOND] = change.carry(state[_SECOND])
-            carried = change.carry(parameter.detach()).requires_grad_()
+            carried = density if name == "density" else change.carry(parameter.detach())
+            carried.requires_grad_()
             self._optimizer.state[carried] = state
             setattr(self, name, carried)
         for group, parameters in zip(self._optimizer.param_groups, self._groups()):
@@ -141,7 +148,7 @@ class FieldParameters:
 
     def state(self) -> dict[str, torch.Tensor]:
         """Parameters and optimiser state by name: all that the next step depends on."""
-        tensors = dict(self._items())
+        tensors = {**dict(self._items()), "density_unit": self.density_unit}
         for name, parameter in self._items():
             for key, value in self._optimizer.state[parameter].items():
                 tensors[f"{name}.{key}"] = value

@@ -9,7 +9,7 @@ from typing import Literal
 import torch
 
 from difftetvr.fit.errors import FitError
-from difftetvr.fit.options import require
+from difftetvr.fit.options import OptionGroup
 from difftetvr.mesh.boundary import BoundaryConstraint
 from difftetvr.mesh.change import MeshChange
 from difftetvr.mesh.motion import MotionLimits, cap_move, guard_move
@@ -25,7 +25,7 @@ _CONSTRAINT = ("vertices", "tangents", "anchors")
 
 
 @dataclass(frozen=True)
-class VertexOptimizerConfig:
+class VertexOptimizerConfig(OptionGroup):
     """How vertices move. No option has a unit of length: steps are counted in altitudes.
 
     The altitude of a vertex is the smallest altitude of all cells around it.
@@ -54,14 +54,14 @@ class VertexOptimizerConfig:
     def __post_init__(self) -> None:
         for name in ("rate", "final_rate"):
             value = getattr(self, name)
-            require(value > 0 and math.isfinite(value), name, value, "greater than 0 and finite")
-        require(all(0 <= beta < 1 for beta in self.betas), "betas", self.betas, "at least 0 and below 1")
+            self._require(value > 0 and math.isfinite(value), name, "greater than 0 and finite")
+        self._require(all(0 <= beta < 1 for beta in self.betas), "betas", "at least 0 and below 1")
         for name in ("barrier", "wall"):
             value = getattr(self, name)
-            require(value >= 0 and math.isfinite(value), name, value, "at least 0 and finite")
-        require(0 < self.cap < 0.25, "cap", self.cap, "between 0 and 0.25")
-        require(0 <= self.coplanarity < 1, "coplanarity", self.coplanarity, "at least 0 and below 1")
-        require(self.boundary in ("fixed", "slide"), "boundary", self.boundary, "fixed or slide")
+            self._require(value >= 0 and math.isfinite(value), name, "at least 0 and finite")
+        self._require(0 < self.cap < 0.25, "cap", "between 0 and 0.25")
+        self._require(0 <= self.coplanarity < 1, "coplanarity", "at least 0 and below 1")
+        self._require(self.boundary in ("fixed", "slide"), "boundary", "fixed or slide")
 
     def rate_at(self, progress: float) -> float:
         """Rate of a step.

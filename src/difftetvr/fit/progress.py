@@ -8,6 +8,7 @@ from types import TracebackType
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
+from difftetvr.errors import counted
 from difftetvr.fit.history import RefinementRecord
 from difftetvr.fit.result import Progress as Status
 
@@ -74,9 +75,9 @@ def _describe(status: Status, speed: float | None) -> str:
     parts = [f"{status.iteration}/{status.iterations}"]
     if speed is not None:
         parts.append(f"{_clock((status.iterations - status.iteration) / speed)} left")
-    parts += [f"PSNR {status.train_psnr:.2f} dB{held_out}", f"{status.cells:,} cells"]
+    parts += [f"PSNR {status.train_psnr:.2f} dB{held_out}", counted(status.cells, "cell")]
     if status.moves.steps:
-        parts.append(f"{status.moves.refused:,} moves refused")
+        parts.append(f"{counted(status.moves.refused, 'move')} refused")
     parts.append(f"loss {status.loss:.2e}")
     if speed is not None:
         parts.append(f"{speed:.1f} it/s")
@@ -85,7 +86,7 @@ def _describe(status: Status, speed: float | None) -> str:
 
 def _describe_refinement(count: int, last: RefinementRecord) -> str:
     predicted = "-" if last.predicted is None else f"{last.predicted:.1e}"
-    changes = f"-{last.removed} +{last.added} vertices, {last.flipped} flips"
+    changes = f"-{last.removed} +{last.added} vertices, {counted(last.flipped, 'flip')}"
     return f"  refinement {count}: {changes}, gain {last.achieved:.1e} (predicted {predicted})"
 
 

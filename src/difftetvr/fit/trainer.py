@@ -14,7 +14,7 @@ from difftetvr.backend import default_device, get_backend
 from difftetvr.capture.capture import Capture
 from difftetvr.errors import CaptureError
 from difftetvr.fit.checkpoint import Checkpoint, describe_capture, require_same_capture
-from difftetvr.fit.config import FitConfig, grid_cubes
+from difftetvr.fit.config import FitConfig
 from difftetvr.fit.errors import FitError
 from difftetvr.fit.evaluation import evaluate, rendered_image, true_image, where_valid
 from difftetvr.fit.history import History, MoveTotals, RefinementRecord
@@ -25,6 +25,7 @@ from difftetvr.fit.parameters import FieldParameters
 from difftetvr.fit.positions import StepReport, VertexOptimizer
 from difftetvr.fit.refinement import Moment, Refinement, Situation, Strategy
 from difftetvr.fit.result import Progress
+from difftetvr.fit.starting_mesh import starting_mesh
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.render import render
 from difftetvr.render.gauss_newton import ImageModel, model_image
@@ -81,7 +82,8 @@ class Trainer:
         self.starts_from_field = start.field is not None
         self._mesh = start.mesh.to(device=_device_of(config, strategy))
         self.budget = self._budget(mesh is not None or config.grid is not None or config.initial_mesh is not None)
-        self.parameters = FieldParameters(self._mesh, config, capture.density_unit, start.field)
+        units = capture.density_units_at(self._sites())
+        self.parameters = FieldParameters(self._mesh, config, units, start.field)
         self.positions = VertexOptimizer(self._mesh, config.motion) if config.move else None
         self.iteration = 0
         self.history = History()
@@ -178,7 +180,7 @@ class Trainer:
         losses, psnrs = self.history.loss[-window:], self.history.psnr[-window:]
         return Progress(
             iteration=self.iteration,
-            iterations=self.config.iterations,
+            iterations=self.config.steps,
             loss=sum(losses) / max(1, len(losses)),
             train_psnr=sum(psnrs) / max(1, len(psnrs)),
             held_out_psnr=self.history.evaluations[-1][1] if self.history.evaluations else None,
@@ -196,13 +198,19 @@ class Trainer:
 
     def _budget(self, mesh_is_given: bool) -> int:
         """The options' cells; a given mesh is its own budget, unless the strategy is to make it grow."""
+        budget = self.config.budget
         if not mesh_is_given:
-            return self.config.cells
-        grows = self.strategy is not None and self.strategy.initial_cells(self.config.cells) < self.config.cells
-        return max(self.config.cells if grows else 0, self._mesh.num_cells)
+            return budget
+        grows = self.strategy is not None and self.strategy.initial_cells(budget) < budget
+        return max(budget if grows else 0, self._mesh.num_cells)
+
+    def _sites(self) -> torch.Tensor:
+        """(N, 3) positions of the vertices, or centres of the cells, that the parameters belong to."""
+        vertices = self._mesh.vertices.detach()
+        return vertices if self.config.location == "vertex" else vertices[self._mesh.tets.long()].mean(1)
 
     def _moment(self) -> Moment:
-        return Moment(self.iteration, self.config.iterations, self._epoch, self.mesh.num_cells, self.budget)
+        return Moment(self.iteration, self.config.steps, self._epoch, self.mesh.num_cells, self.budget)
 
     def _motion_rate(self) -> float | None:
         """Rate of the vertices' steps, None where they stay."""
@@ -272,7 +280,7 @@ class Trainer:
             )
             for view in views
         )
-        return reduce(add, models).scaled(1.0 / len(views)).with_density_unit(self.parameters.density_unit)
+        return reduce(add, models).scaled(1.0 / len(views)).with_density_units(self.mesh, self.parameters.density_unit)
 
     def _error(self, views: Sequence[int]) -> float:
         """Mean squared error over views."""
@@ -362,15 +370,7 @@ def _start(capture: Capture, config: FitConfig, strategy: Strategy | None, mesh:
         return Start(mesh)
     if config.initial_mesh is not None:
         return load_start(capture, config, strategy)
-    return Start(build_grid(capture, config, strategy))
-
-
-def build_grid(capture: Capture, config: FitConfig, strategy: Strategy | None) -> TetMesh:
-    """The Kuhn grid over the capture's bounds that the options ask for."""
-    lower, upper = capture.bounds.tolist()
-    extent = [b - a for a, b in zip(lower, upper, strict=True)]
-    cells = strategy.initial_cells(config.cells) if strategy else config.cells
-    return TetMesh.grid(config.grid or grid_cubes(cells, extent), lower, upper)
+    return Start(starting_mesh(capture, config, strategy))
 
 
 def resolve_device(name: str | None) -> torch.device:

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, Delaunay, QhullError
 
-from difftetvr.errors import MeshError
+from difftetvr.errors import MeshError, counted
 from difftetvr.mesh.arrays import true_indices
 from difftetvr.mesh.faces import face_vertices, match_faces
 from difftetvr.mesh.quality import quality
@@ -51,7 +51,9 @@ def delaunay(points: Any) -> tuple[torch.Tensor, torch.Tensor]:
     if not_finite.size:
         raise MeshError(f"Point {not_finite[0]} is at {positions[not_finite[0]].tolist()}; pass finite positions.")
     if len(positions) < 4:
-        raise MeshError(f"{len(positions)} points make no tetrahedron; pass at least 4 that are not in one plane.")
+        raise MeshError(
+            f"No tetrahedron has {counted(len(positions), 'point')}; pass at least 4 that are not in one plane."
+        )
     lower, upper = positions.min(0), positions.max(0)
     extent = (upper / 2 - lower / 2).max()
     if not extent > 0:

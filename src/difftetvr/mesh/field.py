@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 
-from difftetvr.errors import MeshError
+from difftetvr.errors import MeshError, counted
 from difftetvr.mesh.harmonics import COUNTS, harmonic_basis
 
 if TYPE_CHECKING:
@@ -83,7 +83,7 @@ class Field:
             if len(self) == counts[location]:
                 return location
         wanted = " or ".join(f"{counts[location]} for one per {location}" for location in candidates)
-        raise MeshError(f"The field has {len(self)} values, but this mesh needs {wanted}.")
+        raise MeshError(f"The field has {counted(len(self), 'value')}, but this mesh needs {wanted}.")
 
     def validate(self, mesh: TetMesh) -> None:
         """Check that the field belongs to the mesh and holds values that can be rendered.

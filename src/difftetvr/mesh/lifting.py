@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
-from difftetvr.errors import MeshError
+from difftetvr.errors import MeshError, counted
 from difftetvr.mesh.arrays import true_indices
 from difftetvr.mesh.faces import LOCAL_FACES, match_faces
 from difftetvr.mesh.independent import independent_set
@@ -72,8 +72,8 @@ def lift_flat_cells(points: torch.Tensor, tets: torch.Tensor, flat: torch.Tensor
         if not able.any():
             first = tets[true_indices(flat)[0]].tolist()
             raise MeshError(
-                f"{int(flat.sum())} flat cells are left inside the mesh that moving one of their vertices cannot mend, "
-                f"the first on the vertices {tuple(first)}; remesh it there, or leave the cells around it out."
+                f"Moving a vertex cannot mend {counted(int(flat.sum()), 'flat cell')} inside the mesh, the first on "
+                f"the vertices {tuple(first)}; remesh it there, or leave the cells around it out."
             )
         order = torch.argsort(moves.length[able], stable=True)
         order = order[torch.argsort(on_boundary[moves.vertices[able]][order].int(), stable=True)]

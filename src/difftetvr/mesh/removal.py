@@ -34,7 +34,7 @@ def remove_cells(mesh: TetMesh, removed: torch.Tensor) -> MeshChange:
         )
     cells = true_indices(~removed)
     if not cells.numel():
-        raise MeshError(f"All {mesh.num_cells} cells would be removed; keep at least one.")
+        raise MeshError("All cells would be removed; keep at least one.")
     # Neighbours stay neighbours. The last entry is where index -1, the outside, leads.
     new_cell = torch.full((mesh.num_cells + 1,), -1, dtype=torch.int32, device=cells.device)
     new_cell[cells] = torch.arange(cells.shape[0], dtype=torch.int32, device=cells.device)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from difftetvr.errors import MeshError
+from difftetvr.errors import MeshError, counted
 from difftetvr.mesh.arrays import true_indices
 from difftetvr.mesh.faces import LOCAL_FACES, face_vertices, match_faces
 from difftetvr.mesh.lifting import lift_flat_cells
@@ -67,7 +67,7 @@ class RepairReport:
 
     def __str__(self) -> str:
         """What changed, in words."""
-        flat = f"{_count(self.lifted_cells, 'flat cell', 'flat cells')} got a volume by moving "
+        flat = f"{counted(self.lifted_cells, 'flat cell', 'flat cells')} got a volume by moving "
         way = f"by at most {self.largest_move:.3g} ({self.relative_move:.1e} of the mesh's diagonal)"
         parts = [
             (
@@ -80,13 +80,13 @@ class RepairReport:
             (self.dropped_cells, "flat cell on the boundary was|flat cells on the boundary were", "dropped"),
             (self.dropped_vertices, "vertex that is unused now was|vertices that are unused now were", "dropped"),
         ]
-        said = [f"{_count(count, *words.split('|'))} {what}" for count, words, what in parts if count]
+        said = [f"{counted(count, *words.split('|'))} {what}" for count, words, what in parts if count]
         if self.lifted_cells:
-            said.append(f"{flat}{_count(self.moved_vertices, 'vertex', 'vertices')} {way}")
+            said.append(f"{flat}{counted(self.moved_vertices, 'vertex', 'vertices')} {way}")
         text = " and ".join(filter(None, (", ".join(said[:-1]), *said[-1:]))) or "nothing had to be changed"
         text = f"{text[:1].upper()}{text[1:]}."
         if self.touching_edges:
-            edges = _count(self.touching_edges, "edge", "edges")
+            edges = counted(self.touching_edges, "edge", "edges")
             text += f" The boundary touches itself along {edges}, where cells may share no face."
         return text
 
@@ -175,10 +175,6 @@ def repair(vertices: Any, tets: Any) -> Repaired:
         touching_edges=_touching_edges(mesh),
     )
     return Repaired(mesh, new_index[representative], used, kept, report)
-
-
-def _count(count: int, one: str, many: str) -> str:
-    return f"{count:,} {one if count == 1 else many}"
 
 
 def _merge(points: torch.Tensor, tets: torch.Tensor) -> torch.Tensor:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from PIL import Image, ImageOps
 
 from difftetvr.capture.capture import Capture
-from difftetvr.errors import CaptureError
+from difftetvr.errors import CaptureError, counted
 from difftetvr.fit.evaluation import evaluate, rendered_image, true_image
 from difftetvr.fit.metrics import psnr
 from difftetvr.mesh.field import Field
@@ -42,9 +42,8 @@ def compare_models(capture: Capture, models: list[Model], rows: int = 1, plane: 
     """
     tested = capture.test_indices.tolist()
     if not tested or rows < 1:
-        raise CaptureError(
-            f"'{capture.name}' holds out {len(tested)} views and {rows} are to be shown; show at least 1."
-        )
+        held_out = counted(len(tested), "view")
+        raise CaptureError(f"'{capture.name}' holds out {held_out}, of which to show {rows}; show at least 1.")
     count = min(rows, len(tested))
     means = [evaluate(model.mesh, model.field, capture, tested).mean_psnr or 0.0 for model in models]
     sheet = [_view_row(capture, models, means, tested[(2 * i + 1) * len(tested) // (2 * count)]) for i in range(count)]
@@ -66,7 +65,7 @@ def _view_row(capture: Capture, models: list[Model], means: list[float], view: i
 def _cut_row(models: list[Model], plane: Plane) -> Image.Image:
     last = models[-1]
     panels = [_cut(last, plane, f"cut, {last.name}", outlines=False)]
-    return beside(panels + [_cut(m, plane, f"cut, {m.name}, {m.mesh.num_cells:,} cells") for m in models])
+    return beside(panels + [_cut(m, plane, f"cut, {m.name}, {counted(m.mesh.num_cells, 'cell')}") for m in models])
 
 
 def _cut(model: Model, plane: Plane, label: str, outlines: bool = True) -> Image.Image:

@@ -7,7 +7,7 @@ from typing import Literal
 
 import torch
 
-from difftetvr.fit.options import LARGEST_COUNT, require
+from difftetvr.fit.options import LARGEST_COUNT, OptionGroup
 from difftetvr.fit.refinement.gains import (
     CollapseCosts,
     bisection_gains,
@@ -27,20 +27,23 @@ from difftetvr.mesh.incidence import cell_edges, cells_per_edge, find_edges
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.render.gauss_newton import ImageModel
 
+_LEAST_ROUNDS, _ITERATIONS_PER_ROUND = 40, 60
 _LOOKED_AT = 5.0
 """Vertices whose collapse is priced, in units of those that may vanish."""
 
 
 @dataclass(frozen=True)
-class Exchange:
+class Exchange(OptionGroup):
     """Collapse what predicts the least loss, bisect what predicts the most gain, at a constant number of cells.
 
     A prediction is that of the quadratic model of the squared error (see `difftetvr.render.gauss_newton`) for one
     change alone: g^2 / 2h in one dimension, here in the four of colour and density.
     """
 
-    rounds: int = 40
-    """How often the mesh is refined, evenly spread."""
+    prefix = "exchange."
+
+    rounds: int | None = None
+    """How often the mesh is refined, evenly spread; default: 40 times, or once in 60 iterations if that is more."""
     until: float = 0.85
     """Share of the run after which it is not refined any more."""
     share: float = 0.08
@@ -64,12 +67,12 @@ class Exchange:
     def __post_init__(self) -> None:
         for name in ("rounds", "views"):
             value = getattr(self, name)
-            require(1 <= value <= LARGEST_COUNT, name, value, f"at least 1 and at most {LARGEST_COUNT}")
-        require(0 <= self.until <= 1, "until", self.until, "between 0 and 1")
-        require(0 <= self.share < 1, "share", self.share, "at least 0 and below 1")
-        require(0 < self.initial <= 1, "initial", self.initial, "greater than 0 and at most 1")
-        for name in ("start", "long", "min_quality"):
-            require(0 <= getattr(self, name) <= 1, name, getattr(self, name), "between 0 and 1")
+            valid = value is None or 1 <= value <= LARGEST_COUNT
+            self._require(valid, name, f"at least 1 and at most {LARGEST_COUNT}")
+        self._require(0 <= self.share < 1, "share", "at least 0 and below 1")
+        self._require(0 < self.initial <= 1, "initial", "greater than 0 and at most 1")
+        for name in ("until", "start", "long", "min_quality"):
+            self._require(0 <= getattr(self, name) <= 1, name, "between 0 and 1")
 
     def initial_cells(self, budget: int) -> int:
         """See `Strategy.initial_cells`."""
@@ -85,7 +88,7 @@ class Exchange:
 
     def target(self, moment: Moment) -> int:
         """Cells after the refinement at a moment: they grow by equal factors, up to the budget, and never shrink."""
-        left = 1.0 - self._rounds_done(moment.iteration, moment) / self.rounds
+        left = 1.0 - self._rounds_done(moment.iteration, moment) / self._rounds_of(moment)
         return max(round(moment.budget * self.initial**left), min(moment.cells, moment.budget))
 
     def refine(self, situation: Situation) -> Refinement | None:
@@ -102,12 +105,18 @@ class Exchange:
     def _rounds_done(self, iteration: int, moment: Moment) -> int:
         last = min(self.until * moment.iterations, moment.iterations - 1.0)
         done = max(iteration, 0) / last if last >= 1.0 else 0.0
-        return min(self.rounds, int(self.rounds * done))
+        rounds = self._rounds_of(moment)
+        return min(rounds, int(rounds * done))
+
+    def _rounds_of(self, moment: Moment) -> int:
+        return self.rounds or max(_LEAST_ROUNDS, moment.iterations // _ITERATIONS_PER_ROUND)
 
 
 @dataclass(frozen=True)
 class Grow(Exchange):
     """Growth from a coarse mesh to the budget, by the same predictions; each round also collapses some cells."""
+
+    prefix = "grow."
 
     share: float = 0.04
     """Share of the cells that one round takes away."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
-from difftetvr.fit.options import LARGEST_COUNT, require
+from difftetvr.fit.options import LARGEST_COUNT, OptionGroup
 from difftetvr.fit.refinement.strategy import Moment, Refinement, Situation
 from difftetvr.mesh.change import MeshChange
 from difftetvr.mesh.star import star_subdivision
@@ -17,13 +17,15 @@ _EPOCHS = 2
 
 
 @dataclass(frozen=True)
-class Star:
+class Star(OptionGroup):
     """Subdivide around the vertices with the largest absolute colour gradients, accumulated over the training views.
 
     For one pass over the training views only colours and densities are optimised, for the next one positions too; then
     gradients are accumulated without steps and the mesh is subdivided, until the budget is used up. For comparison:
     the long, thin cells that it makes do not lower the error as `Exchange` does.
     """
+
+    prefix = "star."
 
     share: float = 0.05
     """Share of the vertices whose stars are subdivided in one round."""
@@ -35,10 +37,10 @@ class Star:
     """Share of the run after which the mesh is not subdivided any more."""
 
     def __post_init__(self) -> None:
-        require(1 <= self.views <= LARGEST_COUNT, "views", self.views, f"at least 1 and at most {LARGEST_COUNT}")
-        require(0 <= self.until <= 1, "until", self.until, "between 0 and 1")
+        self._require(1 <= self.views <= LARGEST_COUNT, "views", f"at least 1 and at most {LARGEST_COUNT}")
+        self._require(0 <= self.until <= 1, "until", "between 0 and 1")
         for name in ("share", "initial"):
-            require(0 < getattr(self, name) <= 1, name, getattr(self, name), "greater than 0 and at most 1")
+            self._require(0 < getattr(self, name) <= 1, name, "greater than 0 and at most 1")
 
     def initial_cells(self, budget: int) -> int:
         """See `Strategy.initial_cells`."""

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 import torch
 
-from difftetvr.errors import MeshError
+from difftetvr.errors import MeshError, counted
 from difftetvr.mesh import validation
 from difftetvr.mesh.conversion import CONVERTIBLE, is_quadratic, num_nodes, to_tetrahedra
 from difftetvr.mesh.field import Field, Location
@@ -250,8 +250,8 @@ def _tetrahedra(request: _Request, content: Content) -> _Tets:
         _require_convertible(request, block, len(content.vertices))
         if is_quadratic(block.kind):
             notes.append(
-                f"{len(block.nodes):,} cells of type '{block.kind}' were straightened; what they hold at nodes other "
-                "than their corners was left out."
+                f"Straightened {counted(len(block.nodes), 'cell')} of type '{block.kind}'; what nodes other than "
+                "corners hold was left out."
             )
         pieces, parents = to_tetrahedra(block.kind, block.nodes.astype(np.int64))
         nodes.append(pieces)
@@ -260,16 +260,13 @@ def _tetrahedra(request: _Request, content: Content) -> _Tets:
 
 
 def _require_convertible(request: _Request, block: CellBlock, num_vertices: int) -> None:
-    path, count = request.path, len(block.nodes)
+    path, cells = request.path, f"{counted(len(block.nodes), 'cell')} of type '{block.kind}'"
     if block.kind not in CONVERTIBLE:
-        raise MeshError(
-            f"{path} holds {count:,} cells of type '{block.kind}', which cannot be split into tetrahedra; "
-            "tetrahedralise it first."
-        )
+        raise MeshError(f"{path} holds {cells}, which cannot be split into tetrahedra; tetrahedralise it first.")
     if block.kind != "tetra" and not request.split:
         raise MeshError(
-            f"{path} holds {count:,} cells of type '{block.kind}'; only linear tetrahedra can be rendered, so load "
-            "with split=True (--split of render, info and export) to make tetrahedra of them."
+            f"{path} holds {cells}; only linear tetrahedra can be rendered, so load with split=True (--split of "
+            "render, info and export) to make tetrahedra of them."
         )
     require_array(path, f"cells of type '{block.kind}'", block.nodes, num_nodes(block.kind), "iu")
     outside = (block.nodes < 0) | (block.nodes >= num_vertices)
@@ -304,7 +301,7 @@ def _without_flat(request: _Request, points: torch.Tensor, tets: _Tets) -> tuple
             f"{count:,} of {len(flat):,} cells; load with flat='drop' to leave them out."
         )
     if count == len(flat):
-        raise MeshError(f"{request.path}: none of its {count:,} cells has any volume; give a volume mesh.")
+        raise MeshError(f"{request.path}: of its {counted(count, 'cell')} none has any volume; give a volume mesh.")
     note = (
         f"{count:,} of {len(flat):,} cells {'has' if count == 1 else 'have'} no volume and "
         f"{'was' if count == 1 else 'were'} left out; {'it does' if count == 1 else 'they do'} not change the picture."

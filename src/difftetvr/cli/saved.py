@@ -1,0 +1,121 @@
+"""Options that a command line for ``difftetvr fit`` need not give: those of a file, or of the run to go on with."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from tyro.conf import FlagCreatePairsOff, arg
+
+from difftetvr.cli.options import CaptureOptions
+from difftetvr.errors import DiffTetError
+from difftetvr.fit.config import FitConfig
+from difftetvr.fit.errors import FitError
+from difftetvr.fit.folder import RunFolder
+from difftetvr.fit.options import options_from_json
+
+_LEFT_OPEN: dict[str, Any] = {"capture": None, "capture_options": {}, "fit": {}}
+
+
+@dataclass(frozen=True)
+class SavedRun:
+    """What a run's config.json holds.
+
+    Attributes:
+        capture: Name of the capture; None: left open.
+        capture_options: How it is read.
+        fit: How it is fitted.
+        repair: What mending the initial mesh changed, in words; for the reader.
+    """
+
+    capture: str | None
+    capture_options: CaptureOptions
+    fit: FitConfig
+    repair: str | None = None
+
+    @staticmethod
+    def in_folder(folder: RunFolder) -> SavedRun | None:
+        """The run in a folder; None if it holds none.
+
+        Raises:
+            FitError: The file is damaged.
+        """
+        if not folder.config.is_file():
+            return None
+        refusal = f"--resume cannot use {folder.config} (start anew with --overwrite, or mend it)"
+        return _read(folder.config, {}, refusal)
+
+    @staticmethod
+    def in_file(path: Path) -> SavedRun:
+        """What a file says, and the defaults of all that it does not.
+
+        Raises:
+            FitError: There is no such file, or it is damaged.
+        """
+        if path.is_dir():
+            raise FitError(f"--config cannot use {path}: It is a folder; give a file, such as {path / 'config.json'}.")
+        return _read(path, _LEFT_OPEN, f"--config cannot use {path}")
+
+
+@dataclass(frozen=True)
+class _Origin:
+    """The options that say where the others come from, and so have to be known before those are parsed."""
+
+    output: Annotated[Path | None, arg(aliases=["-o"])] = None
+    config: Path | None = None
+    resume: bool = False
+
+
+def saved_run(args: Sequence[str]) -> SavedRun | None:
+    """The options that stand for those which the arguments of ``difftetvr fit`` do not give; None if there are none.
+
+    Raises:
+        FitError: They cannot be read, or there are two places to take them from.
+    """
+    try:
+        origin, _ = tyro.cli(
+            _Origin,
+            args=args,
+            return_unknown_args=True,
+            add_help=False,
+            console_outputs=False,
+            config=(FlagCreatePairsOff,),
+        )
+    except SystemExit:
+        return None  # What is wrong with the arguments is said when all of them are parsed.
+    if origin.config is not None:
+        if origin.resume:
+            raise FitError("--resume goes on with the options of the run itself; leave out --config, or --resume.")
+        return SavedRun.in_file(origin.config)
+    saved = SavedRun.in_folder(RunFolder(origin.output)) if origin.resume and origin.output is not None else None
+    if saved is None:
+        return None
+    # Whoever resumes names the capture again, which shows that this is the run they mean.
+    return dataclasses.replace(saved, capture=None)
+
+
+def _read(path: Path, base: dict[str, Any], refusal: str) -> SavedRun:
+    """A run's options from JSON.
+
+    Args:
+        path: The file.
+        base: Values of what the file leaves out; all else that has no default must be in it.
+        refusal: Says who cannot use the file, and what to do; what is wrong with it is added.
+    """
+    try:
+        values = json.loads(path.read_bytes())
+    except FileNotFoundError as error:
+        raise FitError(f"{refusal}: There is no such file; check the path.") from error
+    except OSError as error:
+        raise FitError(f"{refusal}: It cannot be read ({error.strerror}); check its permissions.") from error
+    except (ValueError, RecursionError) as error:
+        raise FitError(f"{refusal}: It is no JSON ({error}); correct it there.") from error
+    try:
+        return options_from_json(SavedRun, base | values if isinstance(values, dict) else values)
+    except DiffTetError as error:
+        raise FitError(f"{refusal}: {error}") from error
