@@ -115,6 +115,8 @@ def test_round_trip_is_exact(tmp_path: Path, with_alpha: bool) -> None:
         ({"bounds": torch.zeros(2, 3)}, "bounds"),
         ({"bounds": torch.tensor([[0.0, 0, 0], [1, 1, float("inf")]])}, "not finite"),
         ({"density_unit": -1.0}, "density unit"),
+        ({"surroundings": 0.5}, "surroundings .* at least 1"),
+        ({"surroundings": float("nan")}, "surroundings"),
     ],
 )
 def test_invalid_captures(changes: dict, message: str) -> None:

@@ -26,7 +26,7 @@ from capture.photo_scene import (
 )
 from PIL import Image
 
-from difftetvr.capture import Capture, CaptureWarning, PackedImages, load_capture
+from difftetvr.capture import Capture, CaptureWarning, PackedImages, PhotoCapture, load_capture
 from difftetvr.capture.image_file import read_image
 from difftetvr.errors import CaptureError
 from difftetvr.fit.evaluation import true_image
@@ -80,6 +80,27 @@ def test_downscaling_averages_blocks(tmp_path: Path, factor: int) -> None:
         image = whole.images[view][: height * factor, : width * factor]
         means = image.reshape(height, factor, width, factor, 3).mean(dim=(1, 3))
         assert float((small.images[view] - means).abs().max()) <= 0.501 / 255
+
+
+def test_the_least_downscale_that_fits(tmp_path: Path) -> None:
+    write_camera_list(tmp_path)  # 60 x 40
+    chosen = [PhotoCapture(str(tmp_path)).fitting_downscale(pixels) for pixels in (100, 60, 59, 30, 29, 7)]
+    assert chosen == [1, 1, 2, 2, 3, 9]
+    write_nerf_synthetic(tmp_path / "nerf")
+    assert PhotoCapture(str(tmp_path / "nerf")).fitting_downscale(30) == 2
+    # Where only smaller copies are left, those count.
+    write_colmap(tmp_path / "room")
+    copies = tmp_path / "room" / "images_4"
+    copies.mkdir()
+    for file in sorted((tmp_path / "room" / "images").iterdir()):
+        with Image.open(file) as image:
+            image.resize((15, 10)).save(copies / file.name)
+        file.unlink()
+    chosen = [PhotoCapture(str(tmp_path / "room")).fitting_downscale(pixels) for pixels in (100, 15, 14)]
+    assert chosen == [4, 4, 8]
+    assert load_capture(tmp_path / "room", downscale=4).images.shape == (16, 10, 15, 3)
+    with pytest.raises(CaptureError, match="holds no capture"):
+        PhotoCapture(str(tmp_path / "nowhere")).fitting_downscale(100)
 
 
 def test_jpegs_are_decoded_small(tmp_path: Path) -> None:

@@ -204,21 +204,3 @@ def test_interrupt_saves_a_checkpoint_and_leaves_with_130(tmp_path):
     assert "Traceback" not in rest
     assert (folder / "checkpoint.safetensors").exists()
     assert not (folder / "model.vtu").exists()
-
-
-def test_fit_says_what_it_chose_for_photographs(tmp_path, capsys):
-    """And keeps it with the options, so that the run can be resumed and repeated."""
-    generator = np.random.default_rng(0)
-    poses = np.tile(np.eye(4, dtype=np.float32), (9, 1, 1))
-    poses[:, 2, 3] = 4.0
-    poses[:, 0, 3] = np.linspace(-0.2, 0.2, 9)
-    images = np.zeros((9, 20, 20, 3), np.float32)
-    images[:, 6:14, 6:14] = generator.random((9, 8, 8, 3))
-    np.savez(tmp_path / "tiny.npz", images=images, poses=poses, focal=np.float32(25.0))
-    bounds = ["--bounds", "-1", "-1", "-1", "1", "1", "1"]
-    args = ["fit", str(tmp_path / "tiny.npz"), "-o", str(tmp_path / "out"), *bounds, *FIT]
-    assert cli.main(args) == 0
-    assert "--harmonics 2" in capsys.readouterr().out
-    saved = json.loads((tmp_path / "out" / "config.json").read_text())
-    assert saved["fit"]["harmonics"] == 2 and saved["fit"]["background"] == "black"
-    assert load(tmp_path / "out" / "model.vtu")[1].harmonics is not None

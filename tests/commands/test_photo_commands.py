@@ -1,0 +1,77 @@
+"""Fitting photographs: what is chosen for them, said, kept, and taken back."""
+
+import json
+
+import numpy as np
+import pytest
+from capture.photo_scene import write_colmap, write_nerf_synthetic
+from commands.helpers import fails
+
+from difftetvr import cli
+from difftetvr.mesh.io import load
+
+FIT = ["--cells", "300", "--iterations", "4", "--evaluate-every", "0", "--device", "cpu"]
+
+
+def test_fit_says_what_it_chose_for_photographs(tmp_path, capsys):
+    """And keeps it with the options, so that the run can be resumed and repeated."""
+    generator = np.random.default_rng(0)
+    poses = np.tile(np.eye(4, dtype=np.float32), (9, 1, 1))
+    poses[:, 2, 3] = 4.0
+    poses[:, 0, 3] = np.linspace(-0.2, 0.2, 9)
+    images = np.zeros((9, 20, 20, 3), np.float32)
+    images[:, 6:14, 6:14] = generator.random((9, 8, 8, 3))
+    np.savez(tmp_path / "tiny.npz", images=images, poses=poses, focal=np.float32(25.0))
+    bounds = ["--bounds", "-1", "-1", "-1", "1", "1", "1"]
+    args = ["fit", str(tmp_path / "tiny.npz"), "-o", str(tmp_path / "out"), *bounds, *FIT]
+    assert cli.main(args) == 0
+    assert "--harmonics 2" in capsys.readouterr().out
+    saved = json.loads((tmp_path / "out" / "config.json").read_text())
+    assert saved["fit"]["harmonics"] == 2 and saved["fit"]["background"] == "black"
+    assert load(tmp_path / "out" / "model.vtu")[1].harmonics is not None
+
+
+def test_large_photographs_are_shrunk_and_the_choices_can_be_fed_back(tmp_path, capsys, monkeypatch):
+    write_nerf_synthetic(tmp_path / "ball")
+    monkeypatch.setattr("difftetvr.cli.fit._LONGEST_SIDE", 30)
+    out, again = tmp_path / "out", tmp_path / "again"
+    options = ["--iterations", "4", "--evaluate-every", "0", "--device", "cpu"]
+    assert cli.main(["fit", str(tmp_path / "ball"), "-o", str(out), *options]) == 0
+    said = capsys.readouterr().out
+    assert "Chosen for these images: --downscale 2, --cells 20000, --start hull, --background random" in said
+    saved = json.loads((out / "config.json").read_text())
+    assert saved["capture_options"] == {"downscale": 2}
+    assert (saved["fit"]["cells"], saved["fit"]["start"]) == (20_000, "hull")
+    monkeypatch.setattr("difftetvr.cli.fit._LONGEST_SIDE", 1000)
+    assert cli.main(["fit", "--config", str(out / "config.json"), "-o", str(again)]) == 0
+    assert "Chosen" not in capsys.readouterr().out
+    assert (again / "config.json").read_bytes() == (out / "config.json").read_bytes()
+    assert (again / "model.vtu").read_bytes() == (out / "model.vtu").read_bytes()
+    assert cli.main(["fit", str(tmp_path / "ball"), "-o", str(out), "--resume"]) == 0
+
+
+def test_a_size_that_is_given_stays(tmp_path, monkeypatch):
+    write_nerf_synthetic(tmp_path / "ball")
+    monkeypatch.setattr("difftetvr.cli.fit._LONGEST_SIDE", 30)
+    args = ["fit", str(tmp_path / "ball"), "-o", str(tmp_path / "out"), "--downscale", "1", *FIT]
+    assert cli.main(args) == 0
+    assert json.loads((tmp_path / "out" / "config.json").read_text())["capture_options"] == {"downscale": 1}
+
+
+def test_a_start_that_the_images_do_not_allow(tmp_path, capsys):
+    write_nerf_synthetic(tmp_path / "ball")
+    write_colmap(tmp_path / "room")
+    out = tmp_path / "out"
+    assert "has no points" in fails(capsys, "fit", tmp_path / "ball", "-o", out, *FIT, "--start", "points")
+    assert "Nothing tells" in fails(capsys, "fit", tmp_path / "room", "-o", out, *FIT, "--start", "hull")
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("start", ["grid", "points"])
+def test_a_scene_with_a_background_is_fitted_with_its_surroundings(tmp_path, start):
+    write_colmap(tmp_path / "room")
+    args = ["fit", str(tmp_path / "room"), "-o", str(tmp_path / "out"), *FIT, "--start", start]
+    assert cli.main(args) == 0
+    mesh, field = load(tmp_path / "out" / "model.vtu")
+    lower, upper = mesh.bounds().numpy()
+    assert (upper - lower > 8 * 1.4).all() and field.harmonics is not None
