@@ -5,6 +5,7 @@ import json
 import pytest
 
 from difftetvr.fit import FitConfig, FitError
+from difftetvr.fit.refinement import Exchange
 from difftetvr.mesh.generators import grid_cubes
 
 TOOTH = (103, 94, 161)
@@ -138,3 +139,12 @@ def test_saved_options_that_are_no_object(values):
 
 def test_saved_whole_numbers_are_floats_too():
     assert FitConfig.from_json({"rate": 1, "grid": None, "background": [0, 1, 0]}).background == (0, 1, 0)
+
+
+def test_the_option_that_differs_from_a_saved_run_is_named():
+    saved = FitConfig(cells=500)
+    saved.require_same_run(FitConfig(cells=500, device="cpu", evaluate_every=7))
+    with pytest.raises(FitError, match="has cells = 500, this run asks for 400"):
+        saved.require_same_run(FitConfig(cells=400))
+    with pytest.raises(FitError, match=r"has exchange\.share = 0\.08, this run asks for 0\.1;"):
+        saved.require_same_run(FitConfig(cells=500, exchange=Exchange(share=0.1)))

@@ -266,13 +266,13 @@ class FitConfig:
         Raises:
             FitError: An option that decides the steps differs; names the first one.
         """
-        for item in dataclasses.fields(self):
-            mine, theirs = getattr(self, item.name), getattr(other, item.name)
-            if item.name not in _FREE_OPTIONS and mine != theirs:
-                raise FitError(
-                    f"The saved run has {item.name} = {mine}, this run asks for {theirs}; "
-                    "resume with the same options or start anew."
-                )
+        differing = _first_difference(self, other)
+        if differing is not None:
+            name, mine, theirs = differing
+            raise FitError(
+                f"The saved run has {name} = {mine}, this run asks for {theirs}; resume with the same options or start "
+                "anew."
+            )
 
     def to_json(self) -> dict[str, Any]:
         """The options as JSON values."""
@@ -301,6 +301,17 @@ def _choices_for_photos(capture: Capture) -> dict[str, Any]:
         "background": "black" if capture.alphas is None else "random",
         "harmonics": _PHOTO_BANDS,
     }
+
+
+def _first_difference(first: Any, second: Any, prefix: str = "") -> tuple[str, object, object] | None:
+    """Name and both values of the first option that decides the steps and differs; None if there is none."""
+    for item in dataclasses.fields(first):
+        name, mine, theirs = f"{prefix}{item.name}", getattr(first, item.name), getattr(second, item.name)
+        if name in _FREE_OPTIONS or mine == theirs:
+            continue
+        within = _first_difference(mine, theirs, f"{name}.") if dataclasses.is_dataclass(mine) else None
+        return within or (name, mine, theirs)
+    return None
 
 
 def _positive(value: float) -> bool:
