@@ -35,6 +35,12 @@ def test_fit_volume(tmp_path):
     assert last_number(output, r"PSNR ([\d.]+)") > 23.0
 
 
+def test_fit_photos(tmp_path):
+    output = run(str(ROOT / "examples" / "fit_photos.py"), str(tmp_path), folder=tmp_path)
+    assert last_number(output, r"PSNR ([\d.]+)") > 25.0
+    assert (tmp_path / "fit_photos.png").stat().st_size > 10_000
+
+
 def test_recover_pose(tmp_path):
     output = run(str(ROOT / "examples" / "recover_pose.py"), folder=tmp_path)
     assert last_number(output, r"off by ([\d.]+)") < 0.002

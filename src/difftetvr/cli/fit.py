@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from difftetvr.fit.trainer import Trainer
 
 
-# Beyond, a reconstruction from photographs takes hours on the two cores of a laptop, on a large GPU.
-_LONGEST_SIDE, _LONGEST_SIDE_ON_CUDA = 400, 1600
+# Half an hour on two cores; beyond, a reconstruction from photographs takes hours there.
+_LONGEST_SIDE, _LONGEST_SIDE_ON_CUDA = 240, 1600
 
 
 @dataclass(frozen=True)

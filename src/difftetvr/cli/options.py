@@ -33,7 +33,7 @@ class CaptureOptions:
     """What a folder of photos is; default: found by looking."""
     downscale: int | None = None
     """Pixels of a photo along x and y that are averaged to one; default: 1, for fit so many that the longer side has at
-    most 400 pixels, on CUDA 1600."""
+    most 240 pixels, on CUDA 1600."""
     bounds: tuple[float, float, float, float, float, float] | None = None
     """Box to reconstruct from photos, its lower and its upper corner; default: found."""
 
