@@ -1,9 +1,9 @@
 """Reconstructions from photographs and NeRF-synthetic views: what adaptivity and directional colours buy.
 
-python benchmarks/photos.py CAPTURE [--downscale N] [--cells N] [--rows default no-harmonics grid grid-no-harmonics]
+python benchmarks/photos.py CAPTURE [--downscale N] [--cells N] [--iterations N] [--rows default no-harmonics ...]
 
-CAPTURE is what `difftetvr fit` takes. Each row is one reconstruction with the default options but for what its name
-says; "grid" neither moves nor refines. Every row runs in a process of its own, so that its peak of memory is its own.
+CAPTURE is what `difftetvr fit` takes. Each row is one reconstruction with the options that are chosen for the images but
+for what its name says; "grid" is uniform, and neither moves nor refines. Every row runs in a process of its own, so that its peak of memory is its own.
 """
 
 from __future__ import annotations
@@ -17,21 +17,25 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+_GRID = {"move": False, "refine": "none", "start": "grid"}
 ROWS: dict[str, dict[str, Any]] = {
     "default": {},
     "no-harmonics": {"harmonics": 0},
-    "grid": {"move": False, "refine": "none"},
-    "grid-no-harmonics": {"move": False, "refine": "none", "harmonics": 0},
+    "grid": _GRID,
+    "grid-no-harmonics": _GRID | {"harmonics": 0},
+    "l1-ssim": {"loss": "l1-ssim"},
+    "start-grid": {"start": "grid"},
+    "start-points": {"start": "points"},
 }
 
 
-def measure(source: str, downscale: int, cells: int, name: str) -> dict[str, float]:
+def measure(source: str, downscale: int, options: dict[str, int | None], name: str) -> dict[str, float]:
     """One reconstruction: quality on the held-out views, seconds, MiB at its peak."""
     import difftetvr as dtv
 
     capture = dtv.load_capture(source, downscale=downscale)
     start = time.perf_counter()
-    result = dtv.fit(capture, dtv.FitConfig(cells=cells, evaluate_every=0, **ROWS[name]))
+    result = dtv.fit(capture, dtv.FitConfig(evaluate_every=0, **options, **ROWS[name]))
     return {
         "cells": result.mesh.num_cells,
         "psnr": result.metrics["psnr"],
@@ -46,15 +50,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("capture")
     parser.add_argument("--downscale", type=int, default=1)
-    parser.add_argument("--cells", type=int, default=50_000)
-    parser.add_argument("--rows", nargs="+", choices=ROWS, default=list(ROWS))
+    parser.add_argument("--cells", type=int)
+    parser.add_argument("--iterations", type=int)
+    parser.add_argument("--rows", nargs="+", choices=ROWS, default=list(ROWS)[:4])
     options = parser.parse_args()
     table = Table(title=f"{options.capture}, downscale {options.downscale}; PSNR in dB")
     for heading in ("row", "cells", "held out", "SSIM", "training", "seconds", "MiB"):
         table.add_column(heading, justify="left" if heading == "row" else "right")
     for name in options.rows:
         with ProcessPoolExecutor(1) as process:
-            found = process.submit(measure, options.capture, options.downscale, options.cells, name).result()
+            chosen = {"cells": options.cells, "iterations": options.iterations}
+            found = process.submit(measure, options.capture, options.downscale, chosen, name).result()
         quality = (f"{found['psnr']:.2f}", f"{found['ssim']:.4f}", f"{found['train']:.2f}")
         table.add_row(name, f"{found['cells']:,}", *quality, f"{found['seconds']:.0f}", f"{found['memory']:,.0f}")
         print(name, *quality, flush=True)
