@@ -81,7 +81,7 @@ def test_cubes_that_are_given_are_carved(ball: dtv.Capture) -> None:
 
 
 def test_a_shell_surrounds_the_grid_where_there_are_surroundings(room: dtv.Capture) -> None:
-    mesh = start(room, cells=30_000)
+    mesh = start(room, cells=30_000, start="grid")
     mesh.validate()
     assert abs(mesh.num_cells - 30_000) < 3000
     torch.testing.assert_close(mesh.bounds(), torch.tensor([[-9.0] * 3, [9.0] * 3]))
@@ -113,7 +113,9 @@ def test_what_the_images_lack_is_said(ball: dtv.Capture, room: dtv.Capture) -> N
 
 def test_starts_and_cells_are_chosen_for_the_images(ball: dtv.Capture, room: dtv.Capture) -> None:
     assert dtv.FitConfig().for_capture(ball).start == "hull"
-    assert dtv.FitConfig().for_capture(room).start == "grid"
+    assert dtv.FitConfig().for_capture(room).start == "points"
+    assert dtv.FitConfig().for_capture(dataclasses.replace(room, points=None)).start == "grid"
+    assert dtv.FitConfig(grid=(2, 2, 2)).for_capture(room).start == "grid"
     large = dataclasses.replace(
         ball,
         cameras=[dataclasses.replace(c, width=400, height=400) for c in ball.cameras],
@@ -136,7 +138,7 @@ def test_bisecting_where_units_differ_changes_nothing(room: dtv.Capture) -> None
     from difftetvr.fit.parameters import FieldParameters
     from difftetvr.mesh.bisection import bisect_edges, independent_edges
 
-    mesh = start(room, cells=3_000)
+    mesh = start(room, cells=3_000, start="grid")
     config = dtv.FitConfig(harmonics=0)
     parameters = FieldParameters(mesh, config, room.density_units_at(mesh.vertices))
     with torch.no_grad():

@@ -91,7 +91,8 @@ class FitConfig:
     start: Literal["grid", "hull", "points"] | None = None
     """Mesh to begin with: a grid of near-cubic cubes over the capture's bounds, those of them that no silhouette rules
     out, or the Delaunay mesh of its sparse points and a coarse lattice. Around the bounds of captures without
-    silhouettes comes a shell of growing cells. Default: hull for photographs with silhouettes, else grid."""
+    silhouettes comes a shell of growing cells. Default: for photographs hull where they have silhouettes, else points
+    where there are some; else grid."""
     grid: tuple[int, int, int] | None = None
     """Cubes of the grid along x, y and z, 6 tetrahedra each; overrides --cells, unless the mesh is to grow."""
     initial_mesh: str | None = None
@@ -205,9 +206,20 @@ class FitConfig:
         Args:
             capture: Images and cameras.
         """
-        choices = _choices_for_photos(capture) if capture.encoding == "srgb" else _CHOICES_FOR_VOLUMES
+        choices = self._choices_for_photos(capture) if capture.encoding == "srgb" else _CHOICES_FOR_VOLUMES
         left_open = {name: choices[name] for name in CHOSEN_FOR_CAPTURE if getattr(self, name) is None}
         return dataclasses.replace(self, **left_open)
+
+    def _choices_for_photos(self, capture: Capture) -> dict[str, Any]:
+        pixels = len(capture.train_indices) * math.prod(capture.images.shape[1:3])
+        without_silhouettes = "grid" if capture.points is None or self.grid is not None else "points"
+        return {
+            "cells": max(_DEFAULT_CELLS, min(pixels // _PHOTO_PIXELS_PER_CELL, _MOST_PHOTO_CELLS)),
+            "start": without_silhouettes if capture.silhouettes() is None else "hull",
+            "iterations": _PHOTO_ITERATIONS,
+            "background": "black" if capture.alphas is None else "random",
+            "harmonics": _PHOTO_BANDS,
+        }
 
     def bands_at(self, iteration: int) -> int:
         """Bands of the harmonics that take part in a step: they are switched on one after the other."""
@@ -290,17 +302,6 @@ class FitConfig:
     def _view(self, position: int, view_count: int) -> int:
         epoch, offset = divmod(position, view_count)
         return int(np.random.default_rng([self.seed, _VIEW_STREAM, epoch]).permutation(view_count)[offset])
-
-
-def _choices_for_photos(capture: Capture) -> dict[str, Any]:
-    pixels = len(capture.train_indices) * math.prod(capture.images.shape[1:3])
-    return {
-        "cells": max(_DEFAULT_CELLS, min(pixels // _PHOTO_PIXELS_PER_CELL, _MOST_PHOTO_CELLS)),
-        "start": "grid" if capture.silhouettes() is None else "hull",
-        "iterations": _PHOTO_ITERATIONS,
-        "background": "black" if capture.alphas is None else "random",
-        "harmonics": _PHOTO_BANDS,
-    }
 
 
 def _first_difference(first: Any, second: Any, prefix: str = "") -> tuple[str, object, object] | None:
