@@ -3,8 +3,8 @@
 python benchmarks/photos.py CAPTURE [--downscale N] [--cells N] [--iterations N] [--rows default no-harmonics ...]
 
 CAPTURE is what `difftetvr fit` takes. Each row is one reconstruction with the options chosen for the images, but
-for what its name says; "grid" is uniform, and neither moves nor refines. Every row runs in a process of its own, so that
-its peak of memory is its own.
+for what its name says; "grid" is uniform, and neither moves nor refines. Every row runs in a process of its own, so
+that its peak of memory is its own.
 """
 
 from __future__ import annotations

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from capture.photo_scene import write_colmap, write_nerf_synthetic
 from commands.helpers import fails
+from PIL import Image
 
 from difftetvr import cli
 from difftetvr.mesh.io import load
@@ -33,16 +34,26 @@ def test_fit_says_what_it_chose_for_photographs(tmp_path, capsys):
 
 def test_large_photographs_are_shrunk_and_the_choices_can_be_fed_back(tmp_path, capsys, monkeypatch):
     write_nerf_synthetic(tmp_path / "ball")
-    monkeypatch.setattr("difftetvr.cli.fit._LONGEST_SIDE", 30)
+    monkeypatch.setattr("difftetvr.cli.options._LONGEST_SIDE", 30)
     out, again = tmp_path / "out", tmp_path / "again"
     options = ["--iterations", "4", "--evaluate-every", "0", "--device", "cpu"]
     assert cli.main(["fit", str(tmp_path / "ball"), "-o", str(out), *options]) == 0
     said = capsys.readouterr().out
-    assert "Chosen for these images: --downscale 2, --cells 20000, --start hull, --background random" in said
+    assert "Chosen for this machine: --downscale 2\n" in said
+    assert "Chosen for these images: --cells 20000, --start hull, --background random" in said
     saved = json.loads((out / "config.json").read_text())
     assert saved["capture_options"] == {"downscale": 2}
     assert (saved["fit"]["cells"], saved["fit"]["start"]) == (20_000, "hull")
-    monkeypatch.setattr("difftetvr.cli.fit._LONGEST_SIDE", 1000)
+    # Other commands read the images as fit did, and compare over the same background.
+    assert cli.main(["eval", str(out / "model.vtu"), str(tmp_path / "ball"), "-o", str(tmp_path / "eval.json")]) == 0
+    assert "--downscale 2" in capsys.readouterr().out
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert json.loads((tmp_path / "eval.json").read_text())["psnr"] == pytest.approx(metrics["psnr"], abs=1e-4)
+    sheet = tmp_path / "sheet.png"
+    assert cli.main(["compare", str(tmp_path / "ball"), str(out / "model.vtu"), "-o", str(sheet), "--no-cut"]) == 0
+    assert Image.open(sheet).convert("L").getpixel((5, 200)) == 255
+    capsys.readouterr()
+    monkeypatch.setattr("difftetvr.cli.options._LONGEST_SIDE", 1000)
     assert cli.main(["fit", "--config", str(out / "config.json"), "-o", str(again)]) == 0
     assert "Chosen" not in capsys.readouterr().out
     assert (again / "config.json").read_bytes() == (out / "config.json").read_bytes()
@@ -52,7 +63,7 @@ def test_large_photographs_are_shrunk_and_the_choices_can_be_fed_back(tmp_path, 
 
 def test_a_size_that_is_given_stays(tmp_path, monkeypatch):
     write_nerf_synthetic(tmp_path / "ball")
-    monkeypatch.setattr("difftetvr.cli.fit._LONGEST_SIDE", 30)
+    monkeypatch.setattr("difftetvr.cli.options._LONGEST_SIDE", 30)
     args = ["fit", str(tmp_path / "ball"), "-o", str(tmp_path / "out"), "--downscale", "1", *FIT]
     assert cli.main(args) == 0
     assert json.loads((tmp_path / "out" / "config.json").read_text())["capture_options"] == {"downscale": 1}

@@ -25,30 +25,31 @@ class Eval:
     model: Annotated[Path, Positional, arg(metavar="MODEL")]
     """Mesh with color and density."""
     capture: Annotated[str, Positional, arg(metavar="CAPTURE")]
-    """tooth, or the path of a volume or of a saved capture (.npz)."""
+    """What it was fitted to: tooth, or the path of a volume, of photographs or of a saved capture (.npz)."""
     output: Annotated[Path | None, arg(aliases=["-o"])] = None
     """File to write the numbers to, JSON."""
     all_views: bool = False
     """Compare with the training views, too."""
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Linear R G B behind the volume."""
+    background: tuple[float, float, float] | None = None
+    """R G B behind the volume; default: white for photographs with alpha, else black."""
     device: str | None = None
     """Where to render."""
     views_of: OmitArgPrefixes[CaptureOptions] = field(default_factory=CaptureOptions)
 
     def run(self, console: Console) -> None:
         """Renders the views and prints PSNR and SSIM of each."""
-        from difftetvr.fit.evaluation import evaluate
+        from difftetvr.fit.evaluation import evaluate, usual_background
         from difftetvr.view.describe import evaluation_table
 
         if self.output is not None:
             require_writable(self.output, FitError)
         mesh, field_on_mesh = load_model(self.model, self.device)
-        capture = self.views_of.load(self.capture, console)
+        capture = self.views_of.sized_for(self.capture, self.device, console).load(self.capture, console)
+        background = usual_background(capture) if self.background is None else self.background
         views = list(range(len(capture.cameras))) if self.all_views else capture.test_indices.tolist()
         if not views:
             raise FitError(f"'{capture.name}' holds out no views; compare with all of them with --all-views.")
-        evaluation = evaluate(mesh, field_on_mesh, capture, views, self.background)
+        evaluation = evaluate(mesh, field_on_mesh, capture, views, background)
         console.print(evaluation_table(evaluation))
         if self.output is not None:
             write_json(self.output, evaluation.to_json())

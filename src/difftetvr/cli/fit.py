@@ -26,10 +26,6 @@ if TYPE_CHECKING:
     from difftetvr.fit.trainer import Trainer
 
 
-# Half an hour on two cores; beyond, a reconstruction from photographs takes hours there.
-_LONGEST_SIDE, _LONGEST_SIDE_ON_CUDA = 240, 1600
-
-
 @dataclass(frozen=True)
 class Fit:
     """Reconstruct a tetrahedral volume from images."""
@@ -58,12 +54,12 @@ class Fit:
         folder = RunFolder(self.output)
         self._require_same_run(folder)
         folder.require_free(resume=self.resume, overwrite=self.overwrite)
-        views_of = self.views_of.fitting(self.capture, _longest_side(self.config))
+        views_of = self.views_of.sized_for(self.capture, self.config.device, console)
         capture = views_of.load(self.capture, console)
         trainer = prepare(capture, self.config, resume_from=folder.checkpoint if self.resume else None)
         chosen = dataclasses.replace(self, config=trainer.config, views_of=views_of)
         if capture.encoding == "srgb":
-            _print_choices(console, self, chosen)
+            _print_choices(console, self.config, trainer.config)
         if self.config.initial_mesh is not None:
             _print_start(console, self.config.initial_mesh, trainer)
         # Only now: what cannot even start neither leaves a folder behind nor costs the run that is to be replaced.
@@ -117,21 +113,11 @@ class Fit:
         saved.fit.require_same_run(self.config)
 
 
-def _longest_side(config: FitConfig) -> int:
-    """Pixels that photographs may have along their longer side where nobody says how many."""
-    from difftetvr.fit.trainer import resolve_device
-
-    return _LONGEST_SIDE_ON_CUDA if resolve_device(config.device).type == "cuda" else _LONGEST_SIDE
-
-
-def _print_choices(console: Console, given: Fit, chosen: Fit) -> None:
+def _print_choices(console: Console, given: FitConfig, chosen: FitConfig) -> None:
     """Says what was chosen for photographs where the options left it open."""
-    before, after = given.config, chosen.config
-    unused = {"cells", "start"} if before.initial_mesh else {"cells"} if before.grid else set()
-    left_open = [name for name in CHOSEN_FOR_CAPTURE if getattr(before, name) is None and name not in unused]
-    choices = [f"--{name} {getattr(after, name)}" for name in left_open]
-    if chosen.views_of.downscale != given.views_of.downscale:
-        choices.insert(0, f"--downscale {chosen.views_of.downscale}")
+    unused = {"cells", "start"} if given.initial_mesh else {"cells"} if given.grid else set()
+    left_open = [name for name in CHOSEN_FOR_CAPTURE if getattr(given, name) is None and name not in unused]
+    choices = [f"--{name} {getattr(chosen, name)}" for name in left_open]
     if choices:
         console.print(f"Chosen for these images: {', '.join(choices)}", highlight=False)
 

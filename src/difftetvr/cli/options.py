@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from difftetvr.mesh.io import MeshData
     from difftetvr.mesh.tetmesh import TetMesh
 
+# Half an hour on two cores; beyond, a reconstruction from photographs takes hours there.
+_LONGEST_SIDE, _LONGEST_SIDE_ON_CUDA = 240, 1600
+
 Output = Annotated[Path, arg(aliases=["-o"])]
 
 
@@ -32,8 +35,8 @@ class CaptureOptions:
     format: Literal["nerf-synthetic", "transforms", "colmap", "cameras", "tiny-nerf"] | None = None
     """What a folder of photos is; default: found by looking."""
     downscale: int | None = None
-    """Pixels of a photo along x and y that are averaged to one; default: 1, for fit so many that the longer side has at
-    most 240 pixels, on CUDA 1600."""
+    """Pixels of a photo along x and y that are averaged to one; default: so many that the longer side has at most 240
+    pixels, on CUDA 1600; for info 1."""
     bounds: tuple[float, float, float, float, float, float] | None = None
     """Box to reconstruct from photos, its lower and its upper corner; default: found."""
 
@@ -60,22 +63,28 @@ class CaptureOptions:
     test_every: int | None = None
     """One of so many views is held out; 0: none."""
 
-    def fitting(self, name: str, longest_side: int) -> CaptureOptions:
-        """These options; where they leave the size of photographs open, with one that suits.
+    def sized_for(self, name: str, device: str | None, console: Console) -> CaptureOptions:
+        """These options; where they leave the size of photographs open, with one that suits a device.
 
         Args:
             name: Of the capture.
-            longest_side: Pixels that photographs should have at most along their longer side.
+            device: Name of the device; None: the best one.
+            console: Where to say what was chosen.
         """
         from difftetvr.capture import CaptureWarning, PhotoCapture, is_photo_source
+        from difftetvr.fit.trainer import resolve_device
 
         if self.downscale is not None or not (self.format or is_photo_source(name)):
             return self
         with warnings.catch_warnings():
             # They are said when the images are read.
             warnings.simplefilter("ignore", CaptureWarning)
+            longest_side = _LONGEST_SIDE_ON_CUDA if resolve_device(device).type == "cuda" else _LONGEST_SIDE
             downscale = PhotoCapture(name, self.format).fitting_downscale(longest_side)
-        return dataclasses.replace(self, downscale=downscale) if downscale > 1 else self
+        if downscale == 1:
+            return self
+        console.print(f"Chosen for this machine: --downscale {downscale}", highlight=False)
+        return dataclasses.replace(self, downscale=downscale)
 
     def load(self, name: str, console: Console) -> Capture:
         """Reads or renders the capture of that name."""

@@ -23,7 +23,7 @@ class Compare:
     """Draw held-out views of a capture beside those of models, with PSNR, and a cut through each model."""
 
     capture: Annotated[str, Positional, arg(metavar="CAPTURE")]
-    """tooth, or the path of a volume or of a saved capture (.npz)."""
+    """What they were fitted to: tooth, or the path of a volume, of photographs or of a saved capture (.npz)."""
     models: Annotated[tuple[Path, ...], Positional, arg(metavar="MODEL")]
     """Meshes with color and density."""
     output: Output
@@ -55,7 +55,7 @@ class Compare:
             raise CaptureError(f"The picture is to show {count} but {len(self.names)} --names; give one for each.")
         names = self.names or tuple(path.stem for path in self.models)
         models = [Model(name, *load_model(path, self.device)) for name, path in zip(names, self.models, strict=True)]
-        capture = self.views_of.load(self.capture, console)
+        capture = self.views_of.sized_for(self.capture, self.device, console).load(self.capture, console)
         plane = None if self.no_cut else Plane(self.normal)
         save_picture(self.output, compare_models(capture, models, self.rows, plane))
         console.print(f"Wrote {self.output}")

@@ -17,6 +17,7 @@ from difftetvr.render import render
 
 Color = tuple[float, float, float]
 BLACK: Color = (0.0, 0.0, 0.0)
+WHITE: Color = (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -52,6 +53,11 @@ class Evaluation:
             "psnr_per_view": self.psnr,
             "ssim_per_view": self.ssim,
         }
+
+
+def usual_background(capture: Capture) -> Color:
+    """What held-out views are compared over where nobody says: white for photographs with alpha, else black."""
+    return WHITE if capture.encoding == "srgb" and capture.alphas is not None else BLACK
 
 
 def true_image(capture: Capture, view: int, background: Color = BLACK) -> torch.Tensor:

@@ -8,8 +8,7 @@ from PIL import Image, ImageOps
 
 from difftetvr.capture.capture import Capture
 from difftetvr.errors import CaptureError, counted
-from difftetvr.fit.evaluation import evaluate, rendered_image, true_image
-from difftetvr.fit.metrics import psnr
+from difftetvr.fit.evaluation import Evaluation, evaluate, rendered_image, true_image, usual_background
 from difftetvr.mesh.field import Field
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.view.cut import Plane, cut_picture
@@ -28,7 +27,7 @@ class Model:
 
 
 def compare_models(capture: Capture, models: list[Model], rows: int = 1, plane: Plane | None = None) -> Image.Image:
-    """Draws truth | model | model ... for held-out views over black, labelled with the PSNR of this and of all views.
+    """Draws truth | model | model ... for held-out views, labelled with the PSNR of this and of all views.
 
     Args:
         capture: Cameras and true images.
@@ -45,19 +44,21 @@ def compare_models(capture: Capture, models: list[Model], rows: int = 1, plane: 
         held_out = counted(len(tested), "view")
         raise CaptureError(f"'{capture.name}' holds out {held_out}, of which to show {rows}; show at least 1.")
     count = min(rows, len(tested))
-    means = [evaluate(model.mesh, model.field, capture, tested).mean_psnr or 0.0 for model in models]
-    sheet = [_view_row(capture, models, means, tested[(2 * i + 1) * len(tested) // (2 * count)]) for i in range(count)]
+    background = usual_background(capture)
+    found = [evaluate(model.mesh, model.field, capture, tested, background) for model in models]
+    sheet = [_view_row(capture, models, found, (2 * i + 1) * len(tested) // (2 * count)) for i in range(count)]
     if plane is not None:
         sheet.append(_cut_row(models, plane))
     return below(sheet)
 
 
-def _view_row(capture: Capture, models: list[Model], means: list[float], view: int) -> Image.Image:
-    truth = true_image(capture, view)
-    panels = [_panel(to_picture(truth), f"truth, held-out view {view}")]
-    for model, mean in zip(models, means, strict=True):
-        image = rendered_image(model.mesh, model.field, capture, view)
-        label = f"{model.name}, {psnr(image, truth):.2f} dB (all views {mean:.2f})"
+def _view_row(capture: Capture, models: list[Model], found: list[Evaluation], row: int) -> Image.Image:
+    """Truth and all models, for one of the views that were evaluated."""
+    view, background = found[0].views[row], usual_background(capture)
+    panels = [_panel(to_picture(true_image(capture, view, background)), f"truth, held-out view {view}")]
+    for model, evaluation in zip(models, found, strict=True):
+        image = rendered_image(model.mesh, model.field, capture, view, background)
+        label = f"{model.name}, {evaluation.psnr[row]:.2f} dB (all views {evaluation.mean_psnr:.2f})"
         panels.append(_panel(to_picture(image), label))
     return beside(panels)
 
