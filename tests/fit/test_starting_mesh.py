@@ -102,6 +102,21 @@ def test_points_become_vertices_and_a_lattice_fills_the_rest(room: dtv.Capture, 
     assert float(mesh.volumes().sum()) == pytest.approx(18.0**3, rel=1e-4)
 
 
+@pytest.mark.parametrize("cells", [1, 10, 100])
+@pytest.mark.parametrize("kind", ["grid", "hull", "points"])
+def test_small_budgets(ball: dtv.Capture, room: dtv.Capture, kind: str, cells: int) -> None:
+    mesh = start(ball if kind == "hull" else room, cells=cells, start=kind)
+    mesh.validate()
+    assert 1 <= mesh.num_cells < 400
+
+
+def test_surroundings_thinner_than_a_cube_belong_to_the_grid(room: dtv.Capture) -> None:
+    tight = dataclasses.replace(room, surroundings=1.1)
+    mesh = start(tight, cells=1000, start="grid")
+    torch.testing.assert_close(mesh.bounds(), torch.tensor([[-1.1] * 3, [1.1] * 3]))
+    assert float(mesh.volumes().max() / mesh.volumes().min()) < 1.01
+
+
 def test_what_the_images_lack_is_said(ball: dtv.Capture, room: dtv.Capture) -> None:
     with pytest.raises(FitError, match="has no points to start from; use --start grid"):
         start(ball, start="points")

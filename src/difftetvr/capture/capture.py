@@ -156,6 +156,8 @@ class Capture:
     @property
     def outer_bounds(self) -> torch.Tensor:
         """(2, 3) float32 corners of the box of the surroundings."""
+        if self.surroundings == 1.0:
+            return self.bounds  # to the bit
         middle, half = self.bounds.mean(0), 0.5 * (self.bounds[1] - self.bounds[0])
         return torch.stack((middle - self.surroundings * half, middle + self.surroundings * half))
 

@@ -22,6 +22,7 @@ from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.mesh.topology import Topology
 
 _GROWTH = 1.6  # of the cubes from one layer of a shell to the next
+_MOST_OVER = 1.2  # times the budget
 _CLOSE_ENOUGH = 0.03  # of the budget
 _ATTEMPTS = 8
 _CELLS_PER_POINT = 6.7  # of the Delaunay mesh of random points
@@ -52,16 +53,16 @@ def starting_mesh(capture: Capture, config: FitConfig, strategy: Strategy | None
 
 def _grid_mesh(capture: Capture, cubes: Sequence[int] | None, cells: int) -> TetMesh:
     """The Kuhn grid over the bounds; where there are surroundings, with a shell of growing cubes around it."""
-    bounds, growth = capture.bounds.tolist(), capture.surroundings
-    if growth == 1.0:
-        return TetMesh.grid(cubes or grid_cubes(cells, _sides(capture)), *bounds)
+    growth, sides = capture.surroundings, _sides(capture)
     # As many layers as grow that fast, fewer where there are only cells for thick ones.
     for layers in range(math.ceil(math.log(growth) / math.log(_GROWTH)), 0, -1):
-        shape = cubes or grid_cubes(cells, _sides(capture), layers)
-        if shell_has_room(shape, layers, growth):
-            break
-    vertices, tets = grid_with_shell(shape, layers, bounds, growth)
-    return TetMesh.from_valid(vertices, Topology(tets, vertices.shape[0]))
+        shape = cubes or grid_cubes(cells, sides, layers)
+        count = CELLS_PER_CUBE * math.prod(n + 2 * layers for n in shape)
+        if shell_has_room(shape, layers, growth) and (layers == 1 or cubes or count <= _MOST_OVER * cells):
+            vertices, tets = grid_with_shell(shape, layers, capture.bounds.tolist(), growth)
+            return TetMesh.from_valid(vertices, Topology(tets, vertices.shape[0]))
+    # Without surroundings, or where these are thinner than a cube.
+    return TetMesh.grid(cubes or grid_cubes(cells, sides), *capture.outer_bounds.tolist())
 
 
 def _hull_mesh(capture: Capture, cubes: Sequence[int] | None, cells: int) -> TetMesh:
@@ -78,7 +79,7 @@ def _hull_mesh(capture: Capture, cubes: Sequence[int] | None, cells: int) -> Tet
         return _carved(capture, cubes, _kept_cubes(hull, capture, cubes))
     fine, best = float(cells), None
     for _ in range(_ATTEMPTS):
-        shape = grid_cubes(round(fine), _sides(capture))
+        shape = grid_cubes(max(1, round(fine)), _sides(capture))
         kept = _kept_cubes(hull, capture, shape)
         found = CELLS_PER_CUBE * int(kept.sum())
         if best is None or abs(found - cells) < best[0]:
@@ -120,7 +121,7 @@ def _point_mesh(capture: Capture, cells: int) -> TetMesh:
     is_inside = ((capture.points > outer[0]) & (capture.points < outer[1])).all(1)
     count = cells / _CELLS_PER_POINT
     edge = float(((capture.bounds[1] - capture.bounds[0]).prod() / count) ** (1 / 3))
-    points = _thinned(capture.points[is_inside].double().numpy(), round(_POINTS_SHARE * count), _CROWDED * edge)
+    points = _thinned(capture.points[is_inside].double().numpy(), max(1, round(_POINTS_SHARE * count)), _CROWDED * edge)
     cubes = max(1, round((count - len(points)) / _LATTICE_POINTS_PER_CUBE))
     grid = _grid_mesh(capture, None, CELLS_PER_CUBE * cubes)
     corners = grid.vertices.double().numpy()
@@ -137,11 +138,14 @@ def _point_mesh(capture: Capture, cells: int) -> TetMesh:
 
 def _thinned(points: Floats, most: int, apart: float) -> Floats:
     """One point of each of equal boxes, whose sides are so long that there are at most so many."""
+    if not len(points):
+        return points
     while True:
-        boxes = np.floor((points - points.min(0, initial=0.0)) / apart).astype(np.int64)
-        first = np.unique(boxes, axis=0, return_index=True)[1]
-        if len(first) <= most:
-            return points[np.sort(first)]
+        boxes = ((points - points.min(0)) / apart).astype(np.int64)
+        first = np.unique(np.ravel_multi_index(tuple(boxes.T), boxes.max(0) + 1), return_index=True)[1]
+        points = points[np.sort(first)]
+        if len(points) <= most:
+            return points
         apart *= 1.1
 
 
