@@ -78,6 +78,13 @@ def test_a_start_that_the_images_do_not_allow(tmp_path, capsys):
     assert not out.exists()
 
 
+def test_info_says_what_surrounds_the_object(tmp_path, capsys):
+    write_colmap(tmp_path / "room")
+    assert cli.main(["info", str(tmp_path / "room")]) == 0
+    said = capsys.readouterr().out
+    assert "surroundings" in said and "8 times as large" in said and "sparse points" in said
+
+
 @pytest.mark.parametrize("start", ["grid", "points"])
 def test_a_scene_with_a_background_is_fitted_with_its_surroundings(tmp_path, start):
     write_colmap(tmp_path / "room")

@@ -101,6 +101,10 @@ def capture_table(name: str, capture: Capture) -> Table:
     if capture.points is not None:
         table.add_row("sparse points", f"{capture.points.shape[0]:,}")
     table.add_row("bounds", f"{_point(lower)} to {_point(upper)}")
+    if capture.surroundings > 1.0:
+        table.add_row("surroundings", f"{capture.surroundings:.3g} times as large")
+    if capture.valid is not None:
+        table.add_row("masked", f"{100.0 * float((~capture.valid).float().mean()):.1f} % of the pixels")
     table.add_row("density unit", f"{capture.density_unit:g} per unit length")
     return table
 
