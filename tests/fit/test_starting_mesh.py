@@ -80,6 +80,16 @@ def test_cubes_that_are_given_are_carved(ball: dtv.Capture) -> None:
     assert all(tuple(v) in corners for v in coarse.vertices.tolist())
 
 
+def test_hulls_of_next_to_nothing(ball: dtv.Capture) -> None:
+    dot = torch.zeros_like(ball.alphas)
+    dot[:, 19:21, 19:21] = 1.0
+    mesh = start(dataclasses.replace(ball, alphas=dot), cells=5_000)
+    mesh.validate()
+    assert 500 < mesh.num_cells <= 5_500 and float(mesh.vertices.norm(dim=1).max()) < 0.6
+    with pytest.raises(FitError, match="No place in the bounds of 'ball' lies within the silhouettes"):
+        start(dataclasses.replace(ball, alphas=torch.zeros_like(dot)), cells=5_000)
+
+
 def test_a_shell_surrounds_the_grid_where_there_are_surroundings(room: dtv.Capture) -> None:
     mesh = start(room, cells=30_000, start="grid")
     mesh.validate()

@@ -24,7 +24,7 @@ from difftetvr.mesh.topology import Topology
 _GROWTH = 1.6  # of the cubes from one layer of a shell to the next
 _MOST_OVER = 1.2  # times the budget
 _CLOSE_ENOUGH = 0.03  # of the budget
-_ATTEMPTS = 8
+_ATTEMPTS, _FINEST = 8, 32
 _CELLS_PER_POINT = 6.7  # of the Delaunay mesh of random points
 _POINTS_SHARE = 0.5
 _LATTICE_POINTS_PER_CUBE = 2
@@ -75,19 +75,24 @@ def _hull_mesh(capture: Capture, cubes: Sequence[int] | None, cells: int) -> Tet
         )
     train = capture.train_indices.tolist()
     hull = VisualHull.of([capture.cameras[view] for view in train], masks[train])
-    if cubes is not None:
-        return _carved(capture, cubes, _kept_cubes(hull, capture, cubes))
-    fine, best = float(cells), None
+    fine, best = cells, None
     for _ in range(_ATTEMPTS):
-        shape = grid_cubes(max(1, round(fine)), _sides(capture))
+        shape = cubes or grid_cubes(fine, _sides(capture))
         kept = _kept_cubes(hull, capture, shape)
         found = CELLS_PER_CUBE * int(kept.sum())
         if best is None or abs(found - cells) < best[0]:
             best = abs(found - cells), shape, kept
-        if best[0] <= _CLOSE_ENOUGH * cells:
+        # A hull that fills next to nothing of its bounds begins with fewer cells; refinement adds the others.
+        finer = min(round(fine * cells / max(found, 1)), _FINEST * cells)
+        if best[0] <= _CLOSE_ENOUGH * cells or finer in (0, fine) or cubes:
             break
-        fine *= cells / max(found, 1)
+        fine = finer
     assert best is not None
+    if not best[2].any():
+        raise FitError(
+            f"No place in the bounds of '{capture.name}' lies within the silhouettes of all training views; check the "
+            "bounds and the cameras' poses, or use --start grid."
+        )
     return _carved(capture, *best[1:])
 
 
