@@ -24,6 +24,8 @@ _POINT_MARGIN = 0.05  # in longest sides of the points' box
 _FARTHEST_POINT = 4.0  # in distances of the farthest camera
 _SURROUNDINGS = 8.0  # times the box of the scene, at least
 _BEHIND = 2.0  # and twice as far as the farthest camera
+_FARTHEST = 2000.0  # times its size from the origin: a sixth of a pixel of an image of 1000
+_THINNEST = 0.25  # of the longest side, where surroundings are measured
 _PARALLEL = 1e-3
 
 
@@ -48,6 +50,8 @@ def hull_bounds(cameras: Sequence[Camera], masks: torch.Tensor | None) -> Floats
     while True:
         centers = centers[hull.keeps(centers, cell, _LEAST_SHARE_OF_VIEWS)]
         if not len(centers):
+            if masks is None:
+                raise CaptureError("No place is seen by half of the cameras; give the bounds of what to reconstruct.")
             raise CaptureError(
                 "The silhouettes of the images do not meet anywhere; check the cameras' poses and the images' alpha."
             )
@@ -87,19 +91,36 @@ def surroundings_of(bounds: Floats, cameras: Sequence[Camera]) -> float:
         bounds: (2, 3) box of the scene.
         cameras: Cameras that see it.
     """
-    farthest = (np.abs(2.0 * positions_of(cameras) - bounds.sum(axis=0)) / (bounds[1] - bounds[0])).max()
+    sides = bounds[1] - bounds[0]
+    # Cameras above a flat scene need not be inside: nothing is behind them that they see.
+    sides = np.maximum(sides, _THINNEST * sides.max())
+    farthest = (np.abs(2.0 * positions_of(cameras) - bounds.sum(axis=0)) / sides).max()
     return float(max(_SURROUNDINGS, _BEHIND * farthest))
 
 
-def require_seen(bounds: Floats, cameras: Sequence[Camera], name: str) -> None:
-    """Checks that most cameras see something of the box.
+def require_resolved(bounds: Floats, name: str) -> None:
+    """Checks that the box is not so far from the origin that float32 blurs it.
 
     Raises:
-        CaptureError: More than half of them see nothing of it.
+        CaptureError: It is, as where poses are in geographic coordinates.
+    """
+    distance = np.abs(bounds).max() / (bounds[1] - bounds[0]).max()
+    if distance > _FARTHEST:
+        raise CaptureError(
+            f"The scene of '{name}' lies {distance:,.0f} times its size away from the origin, too far for single "
+            "precision; subtract its centre from the positions of cameras and points."
+        )
+
+
+def require_seen(bounds: Floats, cameras: Sequence[Camera], name: str, most_blind: float = 0.5) -> None:
+    """Checks that enough cameras see something of the box.
+
+    Raises:
+        CaptureError: More than a share ``most_blind`` of them, or all, see nothing of it.
     """
     points = _cell_centers(bounds, _COARSE_GRID)
     blind = [camera for camera in cameras if not in_image(*project(points, camera), camera).any()]
-    if 2 * len(blind) > len(cameras):
+    if len(blind) > most_blind * len(cameras) or len(blind) == len(cameras):
         lower, upper = (np.array2string(corner, precision=3) for corner in bounds)
         raise CaptureError(
             f"{len(blind)} of the {len(cameras)} cameras of '{name}' see nothing of the scene's box {lower} to "
@@ -109,6 +130,10 @@ def require_seen(bounds: Floats, cameras: Sequence[Camera], name: str) -> None:
 
 def _box_of_cameras(cameras: Sequence[Camera]) -> Floats:
     """Cube around the point nearest to all optical axes, as far as the farthest camera."""
+    if len(cameras) < 2:
+        raise CaptureError(
+            "One training view does not say how far the scene is; give bounds, or hold no views out (test_every 0)."
+        )
     positions = positions_of(cameras)
     directions = np.stack([pose_of(camera)[2, :3] for camera in cameras])
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -164,8 +165,8 @@ class Capture:
     def density_units_at(self, points: torch.Tensor) -> torch.Tensor:
         """Typical densities at places, scales for optimisers.
 
-        Inside the bounds that is ``density_unit``. It falls as the distance from their centre grows, as what is farther
-        off is seen, and reconstructed, more coarsely.
+        Inside the bounds, and everywhere without surroundings, that is ``density_unit``. Beyond, it falls as the
+        distance from their centre grows, as what is farther off is seen, and reconstructed, more coarsely.
 
         Args:
             points: (N, 3) positions in world space.
@@ -173,17 +174,19 @@ class Capture:
         Returns:
             (N,) densities per world unit, > 0, of the dtype and on the device of ``points``.
         """
+        if self.surroundings == 1.0:
+            return points.new_full((len(points),), self.density_unit)
         lower, upper = self.bounds.to(points)
         distance = (2.0 * points - lower - upper).abs() / (upper - lower)
         return self.density_unit / distance.amax(1).clamp_min(1.0)
 
+    @cached_property
     def silhouettes(self) -> torch.Tensor | None:
-        """(N, H, W) bool, where the object may be seen: where alpha is not 0, or inside of a black border.
+        """(M, H, W) bool, where the M training views may show the object: where alpha is not 0, or in a black border.
 
-        Returns:
-            The masks, or None where nothing tells the object from its background.
+        None where nothing tells the object from its background.
         """
-        return silhouettes(self.images, self.alphas)
+        return silhouettes(self.images, self.alphas, self.train_indices.tolist())
 
     def save(self, path: str | Path) -> None:
         """Write the capture to one ``.npz`` file, which :meth:`load` reads back to the bit.

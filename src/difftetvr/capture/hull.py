@@ -19,23 +19,29 @@ _SILHOUETTE_PIXELS = 200  # of the shorter side, after coarsening
 _LEAST_ALPHA = 0.02
 _LEAST_RADIANCE = 0.02
 _BLACK_BORDER = 0.95
+# Of all pixels: undistorted photographs may be transparent along their borders.
+_LEAST_TRANSPARENT = 0.1
 
 
-def silhouettes(images: torch.Tensor | PackedImages, alphas: torch.Tensor | PackedImages | None) -> torch.Tensor | None:
-    """(N, H, W) bool, where the object may be seen: where alpha is not 0, or where black surrounds what is not black.
+def silhouettes(
+    images: torch.Tensor | PackedImages, alphas: torch.Tensor | PackedImages | None, views: Sequence[int]
+) -> torch.Tensor | None:
+    """(M, H, W) bool, where the object may be seen: where alpha is not 0, or where black surrounds what is not black.
 
     Args:
         images: (N, H, W, 3) images over black.
         alphas: (N, H, W), or None where they are unknown.
+        views: The M views to look at.
 
     Returns:
-        The masks, or None where nothing tells the object from its background.
+        The masks, or None where nothing tells the object from its background: few pixels are transparent, or it is not
+        black around the object.
     """
     if alphas is not None:
-        masks = torch.stack([alphas[view] > _LEAST_ALPHA for view in range(len(alphas))])
-        return None if bool(masks.all()) else masks
+        masks = torch.stack([alphas[view] > _LEAST_ALPHA for view in views])
+        return masks if float((~masks).float().mean()) >= _LEAST_TRANSPARENT else None
     found, border = [], []
-    for view in range(len(images)):
+    for view in views:
         mask = (images[view] > _LEAST_RADIANCE).any(dim=-1)
         found.append(mask)
         border.append(float((~torch.cat([mask[0], mask[-1], mask[:, 0], mask[:, -1]])).float().mean()))
@@ -74,7 +80,9 @@ class VisualHull:
         chosen = list(cameras)[::step]
         shapes: list[Silhouette | None] = [None] * len(chosen)
         if masks is not None:
-            shapes = [Silhouette.of(mask) for mask in masks[::step]]
+            # A blank image among others would rule out everything that it could see.
+            is_blank = bool(masks.any()) & ~masks[::step].flatten(1).any(1)
+            shapes = [None if no else Silhouette.of(mask) for no, mask in zip(is_blank, masks[::step], strict=True)]
         return VisualHull(chosen, shapes)
 
     def keeps(self, centers: NDArray[np.float64], cell: float, least_share: float) -> NDArray[np.bool_]:

@@ -9,7 +9,7 @@ from typing import Literal, get_args
 import numpy as np
 import torch
 
-from difftetvr.capture.bounds import hull_bounds, point_bounds, require_seen, surroundings_of
+from difftetvr.capture.bounds import hull_bounds, point_bounds, require_resolved, require_seen, surroundings_of
 from difftetvr.capture.camera_list import CAMERAS_FORMAT, read_camera_list
 from difftetvr.capture.capture import Capture
 from difftetvr.capture.colmap import find_colmap_model, read_colmap
@@ -155,13 +155,13 @@ class PhotoCapture:
         """(2, 3) float32 bounds, and the surroundings' factor; only images for training are looked at."""
         train = (~test).nonzero().flatten().tolist() or list(range(len(cameras)))
         seeing = [cameras[view] for view in train]
-        masks = silhouettes(images, alphas)
+        masks = silhouettes(images, alphas, train)
         if self.bounds is not None:
             box = np.array(self.bounds, dtype=np.float64).reshape(2, 3)
         elif photo_set.bounds is not None:
             box = photo_set.bounds
         elif masks is not None:
-            box = hull_bounds(seeing, masks[train])
+            box = hull_bounds(seeing, masks)
         elif photo_set.points is not None:
             box = point_bounds(photo_set.points, seeing)
         elif photo_set.rough_bounds is not None:
@@ -170,7 +170,9 @@ class PhotoCapture:
             box = hull_bounds(seeing, None)
         surroundings = 1.0
         if np.isfinite(box).all() and (box[0] < box[1]).all():
-            require_seen(box, seeing, photo_set.name)
+            # A box that is given may be of something that few cameras look at.
+            require_seen(box, seeing, photo_set.name, most_blind=0.5 if self.bounds is None else 1.0)
+            require_resolved(box, photo_set.name)
             surroundings = 1.0 if masks is not None else surroundings_of(box, seeing)
         return torch.from_numpy(box.astype(np.float32)), surroundings
 

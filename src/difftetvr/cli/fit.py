@@ -115,7 +115,9 @@ class Fit:
 
 def _print_choices(console: Console, given: FitConfig, chosen: FitConfig) -> None:
     """Says what was chosen for photographs where the options left it open."""
-    unused = {"cells", "start"} if given.initial_mesh else {"cells"} if given.grid else set()
+    unused = {"start"} if given.initial_mesh else set()
+    if (given.initial_mesh or given.grid) and given.refine != "grow":
+        unused.add("cells")
     left_open = [name for name in CHOSEN_FOR_CAPTURE if getattr(given, name) is None and name not in unused]
     choices = [f"--{name} {getattr(chosen, name)}" for name in left_open]
     if choices:

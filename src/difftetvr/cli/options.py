@@ -81,9 +81,8 @@ class CaptureOptions:
             warnings.simplefilter("ignore", CaptureWarning)
             longest_side = _LONGEST_SIDE_ON_CUDA if resolve_device(device).type == "cuda" else _LONGEST_SIDE
             downscale = PhotoCapture(name, self.format).fitting_downscale(longest_side)
-        if downscale == 1:
-            return self
-        console.print(f"Chosen for this machine: --downscale {downscale}", highlight=False)
+        if downscale > 1:
+            console.print(f"Chosen for this machine: --downscale {downscale}", highlight=False)
         return dataclasses.replace(self, downscale=downscale)
 
     def load(self, name: str, console: Console) -> Capture:

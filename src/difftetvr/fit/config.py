@@ -94,7 +94,8 @@ class FitConfig:
     silhouettes comes a shell of growing cells. Default: for photographs hull where they have silhouettes, else points
     where there are some; else grid."""
     grid: tuple[int, int, int] | None = None
-    """Cubes of the grid along x, y and z, 6 tetrahedra each; overrides --cells, unless the mesh is to grow."""
+    """Cubes of the grid along x, y and z, 6 tetrahedra each, those of a shell not counted; overrides --cells, unless the
+    mesh is to grow."""
     initial_mesh: str | None = None
     """Mesh file to begin with instead of a grid; its colours and densities, if it has any, are the initial ones. It is
     its own budget; only where it is to grow does --cells say how far."""
@@ -215,7 +216,7 @@ class FitConfig:
         without_silhouettes = "grid" if capture.points is None or self.grid is not None else "points"
         return {
             "cells": max(_DEFAULT_CELLS, min(pixels // _PHOTO_PIXELS_PER_CELL, _MOST_PHOTO_CELLS)),
-            "start": without_silhouettes if capture.silhouettes() is None else "hull",
+            "start": without_silhouettes if capture.silhouettes is None else "hull",
             "iterations": _PHOTO_ITERATIONS,
             "background": "black" if capture.alphas is None else "random",
             "harmonics": _PHOTO_BANDS,

@@ -86,9 +86,14 @@ class FieldParameters:
         harmonics = None if self.harmonics is None else self.harmonics.detach().clone()
         return Field(color, density, self.location, harmonics)
 
-    def values(self) -> torch.Tensor:
-        """(N, 4) copy of all parameters: linear RGB, and density in units of ``density_unit``."""
-        return torch.cat((self.color.detach(), self.density.detach()[:, None]), 1)
+    def values(self, unit: float) -> torch.Tensor:
+        """(N, 4) copy of the field: linear RGB, and density in a unit that is the same everywhere.
+
+        Args:
+            unit: Density per unit length that a value of 1 stands for.
+        """
+        density = self.density.detach() * (self.density_unit / unit)
+        return torch.cat((self.color.detach(), density[:, None]), 1)
 
     def carry(self, change: MeshChange) -> None:
         """Follows a change of the mesh, for parameters on vertices.
@@ -116,15 +121,16 @@ class FieldParameters:
         for group, parameters in zip(self._optimizer.param_groups, self._groups()):
             group["params"] = parameters
 
-    def add(self, surplus: torch.Tensor) -> None:
-        """Changes the values, and projects them to the valid ranges.
+    def add(self, surplus: torch.Tensor, unit: float) -> None:
+        """Changes the field, and projects it to the valid ranges.
 
         Args:
             surplus: (N, 4), in the order of :meth:`values`.
+            unit: Density per unit length that a value of 1 stands for.
         """
         with torch.no_grad():
             self.color += surplus[:, :3]
-            self.density += surplus[:, 3]
+            self.density += surplus[:, 3] * (unit / self.density_unit)
         self._project()
 
     def zero_grad(self) -> None:

@@ -67,14 +67,14 @@ def _grid_mesh(capture: Capture, cubes: Sequence[int] | None, cells: int) -> Tet
 
 def _hull_mesh(capture: Capture, cubes: Sequence[int] | None, cells: int) -> TetMesh:
     """The grid without the cubes that silhouettes rule out, as fine as makes the rest fill the budget."""
-    masks = capture.silhouettes()
+    masks = capture.silhouettes
     if masks is None:
         raise FitError(
             f"Nothing tells the object of '{capture.name}' from its background, as the start from its hull needs; use "
             "--start grid."
         )
     train = capture.train_indices.tolist()
-    hull = VisualHull.of([capture.cameras[view] for view in train], masks[train])
+    hull = VisualHull.of([capture.cameras[view] for view in train], masks)
     fine, best = cells, None
     for _ in range(_ATTEMPTS):
         shape = cubes or grid_cubes(fine, _sides(capture))

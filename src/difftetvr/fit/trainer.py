@@ -232,8 +232,9 @@ class Trainer:
         positions = self.config.refinement_views_at(self.iteration, self.strategy.views, count)
         views = [self._train_views[position] for position in positions]
         mesh = self.mesh
+        values = self.parameters.values(self.capture.density_unit)
         refinement = self.strategy.refine(
-            Situation(mesh, self.parameters.values(), self._moment(), lambda: self._model(views), self._color_gradients)
+            Situation(mesh, values, self._moment(), lambda: self._model(views), self._color_gradients)
         )
         if refinement is None:
             return
@@ -261,7 +262,7 @@ class Trainer:
                 self.positions.carry(change)
             self._mesh = change.mesh
         if refinement.surplus is not None:
-            self.parameters.add(refinement.surplus)
+            self.parameters.add(refinement.surplus, self.capture.density_unit)
 
     def _model(self, views: Sequence[int]) -> ImageModel:
         """Mean over views of the quadratic models of the squared error, in the parameters' units."""
@@ -280,7 +281,7 @@ class Trainer:
             )
             for view in views
         )
-        return reduce(add, models).scaled(1.0 / len(views)).with_density_units(self.mesh, self.parameters.density_unit)
+        return reduce(add, models).scaled(1.0 / len(views)).with_density_unit(self.capture.density_unit)
 
     def _error(self, views: Sequence[int]) -> float:
         """Mean squared error over views."""

@@ -107,7 +107,8 @@ def grid_cubes(cells: int, extent: Sequence[float], layers: int = 0) -> tuple[in
     # With a shell the box has fewer cubes, down to a single one.
     edges = edge * np.exp(np.linspace(-0.5, 0.5 if layers == 0 else math.log(sides.max() / edge) + 0.5, 2001))
     candidates = np.maximum(1, np.rint(sides / edges[:, None])).astype(np.int64)
-    error = np.abs((candidates + 2 * layers).prod(axis=1) * CELLS_PER_CUBE - cells)
+    counts = (candidates + 2 * layers).prod(axis=1) * CELLS_PER_CUBE
+    error = np.where(counts <= MAX_CELLS, np.abs(counts - cells), np.inf)
     # Among equals the one whose edge is closest to that of exact cubes.
     best = np.lexsort((np.abs(np.log(edges / edge)), error))[0]
     nx, ny, nz = (int(n) for n in candidates[best])

@@ -49,16 +49,14 @@ class HatDerivatives:
         """Models of a multiple of the error."""
         return HatDerivatives(*(getattr(self, f.name) * (1.0 if f.name == "weight" else factor) for f in fields(self)))
 
-    def with_density_unit(self, unit: float | torch.Tensor) -> HatDerivatives:
-        """The same models with densities counted in other units.
+    def with_density_unit(self, unit: float) -> HatDerivatives:
+        """The same models with densities counted in another unit.
 
         Args:
-            unit: How much density a coefficient of 1 stands for from now on; one for all, or (N,).
+            unit: How much density a coefficient of 1 stands for from now on.
         """
-        units = torch.as_tensor(unit).to(self.gradient)
-        density, mixed = units * self.gradient[:, 3], units[..., None] * self.coupling
-        gradient = torch.cat((self.gradient[:, :3], density[:, None]), 1)
-        return HatDerivatives(gradient, self.emission, mixed, units * units * self.absorption, self.weight)
+        gradient = torch.cat((self.gradient[:, :3], unit * self.gradient[:, 3:]), 1)
+        return HatDerivatives(gradient, self.emission, unit * self.coupling, unit * unit * self.absorption, self.weight)
 
     def decrease(self, step: torch.Tensor) -> torch.Tensor:
         """How much the error falls by a step of each hat alone, as predicted.
@@ -128,21 +126,10 @@ class ImageModel:
             self.error + other.error,
         )
 
-    def with_density_units(self, mesh: TetMesh, units: torch.Tensor) -> ImageModel:
-        """The same model with densities counted in other units, see :meth:`HatDerivatives.with_density_unit`.
-
-        Args:
-            mesh: The mesh of the model.
-            units: (V,) how much density a coefficient of 1 stands for at each vertex; in between, their means.
-        """
-        on_edges = units[mesh.topology.edges.long()].mean(1)
-        on_faces = units[mesh.topology.faces.long()].mean(1)
-        return ImageModel(
-            self.vertices.with_density_unit(units),
-            self.edges.with_density_unit(on_edges),
-            self.faces.with_density_unit(on_faces),
-            self.error,
-        )
+    def with_density_unit(self, unit: float) -> ImageModel:
+        """The same model with densities counted in another unit, see :meth:`HatDerivatives.with_density_unit`."""
+        vertices, edges, faces = (part.with_density_unit(unit) for part in (self.vertices, self.edges, self.faces))
+        return ImageModel(vertices, edges, faces, self.error)
 
     def scaled(self, factor: float) -> ImageModel:
         """The model of a multiple of the error."""
