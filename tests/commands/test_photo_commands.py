@@ -73,7 +73,9 @@ def test_a_start_that_the_images_do_not_allow(tmp_path, capsys):
     write_nerf_synthetic(tmp_path / "ball")
     write_colmap(tmp_path / "room")
     out = tmp_path / "out"
-    assert "has no points" in fails(capsys, "fit", tmp_path / "ball", "-o", out, *FIT, "--start", "points")
+    assert "has no points within its bounds" in fails(
+        capsys, "fit", tmp_path / "ball", "-o", out, *FIT, "--start", "points"
+    )
     assert "Nothing tells" in fails(capsys, "fit", tmp_path / "room", "-o", out, *FIT, "--start", "hull")
     assert not out.exists()
 

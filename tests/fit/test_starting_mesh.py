@@ -128,8 +128,10 @@ def test_surroundings_thinner_than_a_cube_belong_to_the_grid(room: dtv.Capture) 
 
 
 def test_what_the_images_lack_is_said(ball: dtv.Capture, room: dtv.Capture) -> None:
-    with pytest.raises(FitError, match="has no points to start from; use --start grid"):
+    with pytest.raises(FitError, match="has no points within its bounds to start from; use --start grid"):
         start(ball, start="points")
+    with pytest.raises(FitError, match="has no points within its bounds"):
+        start(dataclasses.replace(room, points=room.points + 100.0), start="points")
     with pytest.raises(FitError, match="Nothing tells the object of 'ball' from its background"):
         start(room, start="hull")
     with pytest.raises(FitError, match=r"grid is .* left out where the mesh starts from points"):
@@ -141,6 +143,7 @@ def test_starts_and_cells_are_chosen_for_the_images(ball: dtv.Capture, room: dtv
     assert dtv.FitConfig().for_capture(room).start == "points"
     assert dtv.FitConfig().for_capture(dataclasses.replace(room, points=None)).start == "grid"
     assert dtv.FitConfig(grid=(2, 2, 2)).for_capture(room).start == "grid"
+    assert dtv.FitConfig().for_capture(dataclasses.replace(room, points=room.points + 100.0)).start == "grid"
     large = dataclasses.replace(
         ball,
         cameras=[dataclasses.replace(c, width=400, height=400) for c in ball.cameras],
@@ -178,3 +181,42 @@ def test_bisecting_where_units_differ_changes_nothing(room: dtv.Capture) -> None
     with torch.no_grad():
         images = [dtv.render(mesh, before, camera), dtv.render(change.mesh, parameters.detached_field(), camera)]
     torch.testing.assert_close(images[0].color, images[1].color, atol=1e-4, rtol=0)
+
+
+def test_a_few_transparent_pixels_are_no_silhouette(ball: dtv.Capture) -> None:
+    corner = torch.ones_like(ball.alphas)
+    corner[:, :4, :4] = 0.0  # as undistorted photographs have
+    assert dataclasses.replace(ball, alphas=corner).silhouettes is None
+    # Held-out views have no say.
+    held_out = torch.where(ball.test[:, None, None], torch.zeros(()), torch.ones_like(ball.alphas))
+    assert dataclasses.replace(ball, alphas=held_out).silhouettes is None
+    assert ball.silhouettes is not None and len(ball.silhouettes) == len(ball.train_indices)
+
+
+def test_a_blank_image_rules_nothing_out(ball: dtv.Capture) -> None:
+    alphas = ball.alphas.clone()
+    alphas[1] = 0.0
+    options = {"grid": (10, 10, 10)}
+    blank, whole = start(dataclasses.replace(ball, alphas=alphas), **options), start(ball, **options)
+    assert whole.num_cells <= blank.num_cells < 1.2 * whole.num_cells
+
+
+def test_refinement_predicts_nothing_where_nothing_would_change(room: dtv.Capture) -> None:
+    """Colours and densities are the same everywhere, so flips and collapses are worth nothing, also in the shell."""
+    from difftetvr.fit.refinement.gains import collapse_costs, flip_gains
+    from difftetvr.fit.trainer import Trainer
+    from difftetvr.mesh.boundary import removable_vertices
+    from difftetvr.mesh.flip_search import find_flips
+
+    trainer = Trainer(room, dtv.FitConfig(cells=3_000, start="grid", harmonics=0, device="cpu"))
+    with torch.no_grad():
+        trainer.parameters.density.copy_(0.05 * room.density_unit / trainer.parameters.density_unit)
+    values = trainer.parameters.values(room.density_unit)
+    torch.testing.assert_close(values[:, 3], torch.full_like(values[:, 3], 0.05))
+    model = trainer._model([1, 2])
+    bisections = model.edges.gradient.abs().max()
+    mesh = trainer.mesh
+    flips = flip_gains(find_flips(mesh, min_quality=0.0), values, model)
+    costs = collapse_costs(mesh, values, model.vertices, removable_vertices(mesh, slide=True), 1.0)
+    assert float(bisections) > 1e-5
+    assert float(flips.abs().max()) < 1e-9 and float(costs.cost.abs().max()) < 1e-9

@@ -53,8 +53,8 @@ def test_comparison_shows_truth_reconstruction_and_difference():
 
 def test_comparisons_are_stacked(tmp_path):
     image = torch.rand(300, 200, 3)
-    save_comparisons(tmp_path / "one.png", [("truth", image, image)])
-    save_comparisons(tmp_path / "three.png", [("truth", image, image)] * 3)
+    save_comparisons(tmp_path / "one.png", [("truth", image, image, 1.0)])
+    save_comparisons(tmp_path / "three.png", [("truth", image, image, 1.0)] * 3)
     one, three = (Image.open(tmp_path / name).size for name in ("one.png", "three.png"))
     assert one[0] == three[0]
     assert three[1] >= 3 * one[1]

@@ -180,6 +180,15 @@ class Capture:
         distance = (2.0 * points - lower - upper).abs() / (upper - lower)
         return self.density_unit / distance.amax(1).clamp_min(1.0)
 
+    @property
+    def scene_points(self) -> torch.Tensor | None:
+        """(P', 3) those of the points that lie within the outer bounds, or None where there are none."""
+        if self.points is None:
+            return None
+        outer = self.outer_bounds
+        inside = self.points[((self.points > outer[0]) & (self.points < outer[1])).all(1)]
+        return inside if len(inside) else None
+
     @cached_property
     def silhouettes(self) -> torch.Tensor | None:
         """(M, H, W) bool, where the M training views may show the object: where alpha is not 0, or in a black border.

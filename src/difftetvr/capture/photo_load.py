@@ -21,7 +21,7 @@ from difftetvr.errors import CameraError, CaptureError
 from difftetvr.render.camera import Camera
 
 _MOST_WORKERS = 8
-_MOST_DOWNSCALE = 64  # of the smaller copies that are looked for
+_SMALLEST_COPY = 64  # of the smaller copies that are looked for
 # Sides that differ by less are cropped: COLMAP's undistorter gives every image a size of its own.
 _CROPPED_SHARE, _CROPPED_PIXELS = 0.01, 2
 
@@ -135,7 +135,7 @@ def fitting_downscale(photo_set: PhotoSet, longest_side: int) -> int:
         CaptureError: The image cannot be read.
     """
     for view in photo_set.views:
-        for downscale in range(1, _MOST_DOWNSCALE + 1):
+        for downscale in range(1, _SMALLEST_COPY + 1):
             found = view.file(downscale)
             if found is None:
                 continue

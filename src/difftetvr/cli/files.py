@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -25,7 +26,8 @@ class Eval:
     model: Annotated[Path, Positional, arg(metavar="MODEL")]
     """Mesh with color and density."""
     capture: Annotated[str, Positional, arg(metavar="CAPTURE")]
-    """What it was fitted to: tooth, or the path of a volume, of photographs or of a saved capture (.npz)."""
+    """What it was fitted to: tooth, or the path of a volume, of photographs or of a saved capture (.npz), with the
+    options by which it was read."""
     output: Annotated[Path | None, arg(aliases=["-o"])] = None
     """File to write the numbers to, JSON."""
     all_views: bool = False
@@ -93,6 +95,8 @@ class Export:
     """File to write: .vtu, .vtk, .msh, .xdmf, .npz, .bintet, .ovm or .node with its .ele; .mesh with --geometry."""
     geometry: bool = False
     """Leave out color and density."""
+    without_harmonics: bool = False
+    """Leave out what colours owe to the direction, which only .vtu and .npz can hold."""
     reading: OmitArgPrefixes[MeshOptions] = field(default_factory=MeshOptions)
 
     def run(self, console: Console) -> None:
@@ -103,6 +107,8 @@ class Export:
         require_writable(self.output, MeshError)
         data = self.reading.load(self.model, console)
         field_on_mesh = None if self.geometry else data.field
+        if field_on_mesh is not None and self.without_harmonics:
+            field_on_mesh = dataclasses.replace(field_on_mesh, harmonics=None)
         if field_on_mesh is not None:
             require_writable_format(self.output)
         save(self.output, data.mesh, field_on_mesh)

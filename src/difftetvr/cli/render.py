@@ -117,7 +117,7 @@ class Render:
 
     def run(self, console: Console) -> None:
         """Renders and writes the picture."""
-        from difftetvr.fit.trainer import resolve_device
+        from difftetvr.fit.requirements import resolve_device
         from difftetvr.render import OrderWarning
         from difftetvr.view.pictures import require_png
 

@@ -94,7 +94,7 @@ class FitConfig:
     silhouettes comes a shell of growing cells. Default: for photographs hull where they have silhouettes, else points
     where there are some; else grid."""
     grid: tuple[int, int, int] | None = None
-    """Cubes of the grid along x, y and z, 6 tetrahedra each, those of a shell not counted; overrides --cells, unless the
+    """Cubes of the grid along x, y and z, 6 tetrahedra each, without those of a shell; overrides --cells, unless the
     mesh is to grow."""
     initial_mesh: str | None = None
     """Mesh file to begin with instead of a grid; its colours and densities, if it has any, are the initial ones. It is
@@ -213,7 +213,7 @@ class FitConfig:
 
     def _choices_for_photos(self, capture: Capture) -> dict[str, Any]:
         pixels = len(capture.train_indices) * math.prod(capture.images.shape[1:3])
-        without_silhouettes = "grid" if capture.points is None or self.grid is not None else "points"
+        without_silhouettes = "grid" if capture.scene_points is None or self.grid is not None else "points"
         return {
             "cells": max(_DEFAULT_CELLS, min(pixels // _PHOTO_PIXELS_PER_CELL, _MOST_PHOTO_CELLS)),
             "start": without_silhouettes if capture.silhouettes is None else "hull",

@@ -27,7 +27,8 @@ class Evaluation:
     Attributes:
         views: Indices of the views in the capture.
         psnr: PSNR in dB of each.
-        ssim: SSIM of each; empty where the images are smaller than its window of 11 x 11 pixels.
+        ssim: SSIM of each, in which masked pixels are right; empty where the images are smaller than its window of
+            11 x 11 pixels.
     """
 
     views: list[int]
@@ -84,6 +85,11 @@ def where_valid(capture: Capture, view: int, image: torch.Tensor, truth: torch.T
     return torch.where(capture.valid[view].to(image.device)[..., None], image, truth)
 
 
+def valid_share(capture: Capture, view: int) -> float:
+    """Share of a view's pixels that the capture's mask does not leave out."""
+    return 1.0 if capture.valid is None else float(capture.valid[view].float().mean())
+
+
 @torch.no_grad()
 def rendered_image(mesh: TetMesh, field: Field, capture: Capture, view: int, background: Color = BLACK) -> torch.Tensor:
     """(H, W, 3) image of the reconstruction from the camera of a view, on the CPU."""
@@ -100,15 +106,15 @@ def evaluate(
         mesh: The reconstruction's mesh, on any device.
         field: Its colours and densities.
         capture: Cameras and true images.
-        views: Indices of the views to compare.
+        views: Indices of the views to compare; those without any valid pixel are left out.
         background: Linear RGB behind the volume.
     """
     psnrs, ssims = [], []
+    views = [view for view in views if valid_share(capture, view) > 0.0]
     for view in views:
         truth = true_image(capture, view, background)
         image = where_valid(capture, view, rendered_image(mesh, field, capture, view, background), truth)
-        share = 1.0 if capture.valid is None else float(capture.valid[view].float().mean())
-        psnrs.append(psnr(image, truth, share))
+        psnrs.append(psnr(image, truth, valid_share(capture, view)))
         if min(truth.shape[:2]) >= SSIM_WINDOW:
             ssims.append(ssim(image, truth))
-    return Evaluation(list(views), psnrs, ssims)
+    return Evaluation(views, psnrs, ssims)

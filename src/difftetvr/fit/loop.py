@@ -37,7 +37,7 @@ def fit(
     Args:
         capture: Cameras and images; those of ``capture.test`` are never trained on.
         config: Options; default: those of the Tooth benchmark.
-        mesh: Mesh to begin with; default: that of ``config``, a file or the grid over ``capture.bounds``.
+        mesh: Mesh to begin with; default: that of ``config``, a file or one made for the capture.
         strategy: How the mesh is refined, for strategies of your own; default: as ``config.refine`` says.
         checkpoint: File to save the state to before the first iteration, every ``config.checkpoint_seconds``, after the
             last one, and when interrupted by SIGINT or SIGTERM.
@@ -74,7 +74,7 @@ def prepare(
     Args:
         capture: Cameras and images.
         config: Options.
-        mesh: Mesh to begin with; default: the file or the grid of ``config``.
+        mesh: Mesh to begin with; default: that of ``config``, a file or one made for the capture.
         strategy: How the mesh is refined; default: as ``config.refine`` says.
         resume_from: Checkpoint to go on from if it exists.
 

@@ -120,31 +120,25 @@ def _point_mesh(capture: Capture, cells: int) -> TetMesh:
     The lattice is body-centred cubic, whose Delaunay cells are the best that fill space alike. It grows coarser
     through the surroundings as the grid's shell does.
     """
-    if capture.points is None:
-        raise FitError(f"'{capture.name}' has no points to start from; use --start grid.")
-    outer = capture.outer_bounds
-    is_inside = ((capture.points > outer[0]) & (capture.points < outer[1])).all(1)
+    if capture.scene_points is None:
+        raise FitError(f"'{capture.name}' has no points within its bounds to start from; use --start grid.")
     count = cells / _CELLS_PER_POINT
     edge = float(((capture.bounds[1] - capture.bounds[0]).prod() / count) ** (1 / 3))
-    points = _thinned(capture.points[is_inside].double().numpy(), max(1, round(_POINTS_SHARE * count)), _CROWDED * edge)
+    points = _thinned(capture.scene_points.double().numpy(), max(1, round(_POINTS_SHARE * count)), _CROWDED * edge)
     cubes = max(1, round((count - len(points)) / _LATTICE_POINTS_PER_CUBE))
     grid = _grid_mesh(capture, None, CELLS_PER_CUBE * cubes)
     corners = grid.vertices.double().numpy()
     centers = corners[grid.tets.view(-1, CELLS_PER_CUBE * 4).numpy()].mean(1)
     lattice = np.concatenate((corners, centers))
-    if len(points):
-        spacing = cKDTree(lattice).query(lattice, 2)[0][:, 1]
-        on_hull = (corners <= corners.min(0)).any(1) | (corners >= corners.max(0)).any(1)
-        is_free = cKDTree(points).query(lattice)[0] > _CROWDED * spacing
-        is_free[: len(corners)] |= on_hull
-        lattice = np.concatenate((lattice[is_free], points))
-    return TetMesh.delaunay(torch.from_numpy(lattice.astype(np.float32)))
+    spacing = cKDTree(lattice).query(lattice, 2)[0][:, 1]
+    is_kept = cKDTree(points).query(lattice)[0] > _CROWDED * spacing
+    # The outer box keeps its shape.
+    is_kept[: len(corners)] |= (corners <= corners.min(0)).any(1) | (corners >= corners.max(0)).any(1)
+    return TetMesh.delaunay(torch.from_numpy(np.concatenate((lattice[is_kept], points)).astype(np.float32)))
 
 
 def _thinned(points: Floats, most: int, apart: float) -> Floats:
     """One point of each of equal boxes, whose sides are so long that there are at most so many."""
-    if not len(points):
-        return points
     while True:
         boxes = ((points - points.min(0)) / apart).astype(np.int64)
         first = np.unique(np.ravel_multi_index(tuple(boxes.T), boxes.max(0) + 1), return_index=True)[1]

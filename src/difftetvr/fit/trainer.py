@@ -10,13 +10,11 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from difftetvr.backend import default_device, get_backend
 from difftetvr.capture.capture import Capture
-from difftetvr.errors import CaptureError
 from difftetvr.fit.checkpoint import Checkpoint, describe_capture, require_same_capture
 from difftetvr.fit.config import FitConfig
 from difftetvr.fit.errors import FitError
-from difftetvr.fit.evaluation import evaluate, rendered_image, true_image, where_valid
+from difftetvr.fit.evaluation import evaluate, rendered_image, true_image, valid_share, where_valid
 from difftetvr.fit.history import History, MoveTotals, RefinementRecord
 from difftetvr.fit.initial import Start, load_start
 from difftetvr.fit.losses import LOSSES, sparsity
@@ -24,6 +22,7 @@ from difftetvr.fit.metrics import psnr_of_mse
 from difftetvr.fit.parameters import FieldParameters
 from difftetvr.fit.positions import StepReport, VertexOptimizer
 from difftetvr.fit.refinement import Moment, Refinement, Situation, Strategy
+from difftetvr.fit.requirements import device_for, require_fittable
 from difftetvr.fit.result import Progress
 from difftetvr.fit.starting_mesh import starting_mesh
 from difftetvr.mesh.tetmesh import TetMesh
@@ -34,7 +33,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 _GLANCE_VIEWS = 4
-_WITHOUT_DOUBLES = ("mps",)
+_LEAST_SHARE = 1e-6  # of the pixels: a view that is masked altogether has no error
 _POSITIONS = "positions."  # prefix of the positions' state in a checkpoint
 
 
@@ -62,7 +61,7 @@ class Trainer:
         Args:
             capture: Images and cameras.
             config: Options.
-            mesh: Mesh to begin with; default: the file or the grid that the options ask for.
+            mesh: Mesh to begin with; default: the file or the starting mesh that the options ask for.
             strategy: How to refine it; default: as the options say.
 
         Raises:
@@ -80,7 +79,7 @@ class Trainer:
         start = _start(capture, config, strategy, mesh)
         self.repair = start.repair
         self.starts_from_field = start.field is not None
-        self._mesh = start.mesh.to(device=_device_of(config, strategy))
+        self._mesh = start.mesh.to(device=device_for(config, strategy))
         self.budget = self._budget(mesh is not None or config.grid is not None or config.initial_mesh is not None)
         units = capture.density_units_at(self._sites())
         self.parameters = FieldParameters(self._mesh, config, units, start.field)
@@ -291,7 +290,8 @@ class Trainer:
         for view in views:
             truth = true_image(self.capture, view, background)
             image = rendered_image(self.mesh, field, self.capture, view, background)
-            errors.append(float((where_valid(self.capture, view, image, truth) - truth).square().mean()))
+            squares = (where_valid(self.capture, view, image, truth) - truth).square()
+            errors.append(float(squares.mean()) / max(valid_share(self.capture, view), _LEAST_SHARE))
         return sum(errors) / len(errors)
 
     def _color_gradients(self) -> torch.Tensor:
@@ -320,50 +320,16 @@ class Trainer:
             deterministic=self.config.deterministic,
         ).color
         image = where_valid(self.capture, view, image, truth)
-        loss = LOSSES[self.config.loss](image, truth)
+        share = max(valid_share(self.capture, view), _LEAST_SHARE)
+        loss = LOSSES[self.config.loss](image, truth) / share
         if self.config.sparsity:
             loss = loss + self.config.sparsity * sparsity(self.parameters.density)
         (weight * loss).backward()
-        return float(loss.detach()), float((image.detach() - truth).square().mean())
+        return float(loss.detach()), float((image.detach() - truth).square().mean()) / share
 
 
 def _added(totals: MoveTotals, report: StepReport) -> MoveTotals:
     return MoveTotals(*(a + b for a, b in zip(astuple(totals), (1, *astuple(report)), strict=True)))
-
-
-def require_fittable(capture: Capture, config: FitConfig, strategy: Strategy | None) -> None:
-    """Checks what can be known before the first iteration.
-
-    Raises:
-        CaptureError: The images have no alpha but the background needs it.
-        FitError: The device does not exist or cannot move vertices, or a strategy would refine a field on cells.
-        BackendError: No back end works, or the device has none.
-    """
-    if strategy is not None and config.location == "cell":
-        raise FitError("A field on cells cannot be refined; put it on vertices (location vertex), or do not refine.")
-    if config.needs_alpha and capture.alphas is None:
-        raise CaptureError(
-            f"The images of '{capture.name}' have no alpha, which the background {config.background} needs; "
-            "use background black."
-        )
-    device = _device_of(config, strategy)
-    if device.type in _WITHOUT_DOUBLES and _changes_meshes(config, strategy):
-        raise FitError(
-            f"Vertices move and meshes change in double precision, which {device.type} lacks; use the device cpu, or "
-            "neither move nor refine (--no-move --refine none)."
-        )
-
-
-def _changes_meshes(config: FitConfig, strategy: Strategy | None) -> bool:
-    return config.move or strategy is not None
-
-
-def _device_of(config: FitConfig, strategy: Strategy | None) -> torch.device:
-    """The device that the options name; by default the best one that can do what they ask for."""
-    device = resolve_device(config.device)
-    if config.device is None and device.type in _WITHOUT_DOUBLES and _changes_meshes(config, strategy):
-        return resolve_device("cpu")
-    return device
 
 
 def _start(capture: Capture, config: FitConfig, strategy: Strategy | None, mesh: TetMesh | None) -> Start:
@@ -372,22 +338,3 @@ def _start(capture: Capture, config: FitConfig, strategy: Strategy | None, mesh:
     if config.initial_mesh is not None:
         return load_start(capture, config, strategy)
     return Start(starting_mesh(capture, config, strategy))
-
-
-def resolve_device(name: str | None) -> torch.device:
-    """The device of that name, the best that works for None.
-
-    Raises:
-        FitError: There is no such device here.
-        BackendError: It has no back end, or its back end does not work.
-    """
-    if name is None:
-        return default_device()
-    try:
-        device = torch.device(name)
-        torch.empty(1, device=device)
-    except (RuntimeError, AssertionError, NotImplementedError) as error:
-        reason = str(error).splitlines()[0].rstrip(".")
-        raise FitError(f"The device '{name}' cannot be used ({reason}); use cpu, cuda or mps.") from error
-    get_backend(name)
-    return device

@@ -34,7 +34,9 @@ def save_png(path: str | Path, image: torch.Tensor) -> None:
     save_picture(path, to_picture(image))
 
 
-def comparison(truth: torch.Tensor, reconstruction: torch.Tensor, name: str = "truth") -> Image.Image:
+def comparison(
+    truth: torch.Tensor, reconstruction: torch.Tensor, name: str = "truth", share: float = 1.0
+) -> Image.Image:
     """Truth | reconstruction | difference side by side, labelled with the PSNR.
 
     The difference is absolute, per channel and four times as bright. Small images are enlarged by repeating pixels.
@@ -43,27 +45,28 @@ def comparison(truth: torch.Tensor, reconstruction: torch.Tensor, name: str = "t
         truth: (H, W, 3) true image.
         reconstruction: (H, W, 3) rendered image.
         name: Label of the first panel.
+        share: Part of the pixels that count for the PSNR; both images are the same in the others.
     """
     difference = _DIFFERENCE_GAIN * (reconstruction - truth).abs()
     panels = [
         (name, truth),
-        (f"reconstruction, {psnr(reconstruction, truth):.2f} dB", reconstruction),
+        (f"reconstruction, {psnr(reconstruction, truth, share):.2f} dB", reconstruction),
         (f"difference x {_DIFFERENCE_GAIN}", difference),
     ]
     return beside([labelled(to_picture(image), label) for label, image in panels])
 
 
-def save_comparisons(path: str | Path, rows: list[tuple[str, torch.Tensor, torch.Tensor]]) -> None:
+def save_comparisons(path: str | Path, rows: list[tuple[str, torch.Tensor, torch.Tensor, float]]) -> None:
     """Writes a PNG with one :func:`comparison` below the other.
 
     Args:
         path: File to write.
-        rows: Name, (H, W, 3) truth and (H, W, 3) reconstruction of each view; at least one.
+        rows: Name, (H, W, 3) truth, (H, W, 3) reconstruction and share of valid pixels of each view; at least one.
 
     Raises:
         CaptureError: The file cannot be written, or its name does not end in .png.
     """
-    pictures = [comparison(truth, reconstruction, name) for name, truth, reconstruction in rows]
+    pictures = [comparison(truth, reconstruction, name, share) for name, truth, reconstruction, share in rows]
     save_picture(path, below(pictures))
 
 

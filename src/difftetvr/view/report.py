@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from difftetvr.capture.capture import Capture
 from difftetvr.errors import CaptureError
-from difftetvr.fit.evaluation import rendered_image, true_image
+from difftetvr.fit.evaluation import rendered_image, true_image, valid_share, where_valid
 from difftetvr.fit.folder import RunFolder, write_json
 from difftetvr.fit.result import FitResult
 from difftetvr.mesh.io import save
@@ -53,7 +53,8 @@ def _write_pictures(folder: RunFolder, result: FitResult, capture: Capture) -> N
         save_png(folder.views / f"{view:04d}_truth.png", truth)
         save_png(folder.views / f"{view:04d}_reconstruction.png", image)
         if view in compared:
-            rows.append((f"truth, view {view}", truth, image))
+            shown = where_valid(capture, view, image, truth)
+            rows.append((f"truth, view {view}", truth, shown, valid_share(capture, view)))
     save_comparisons(folder.comparison, rows)
 
 

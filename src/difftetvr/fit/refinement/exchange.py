@@ -43,7 +43,7 @@ class Exchange(OptionGroup):
     prefix = "exchange."
 
     rounds: int | None = None
-    """How often the mesh is refined, evenly spread; default: 40 times, or a sixtieth of the iterations if that is more."""
+    """How often the mesh is refined, evenly spread; default: 40 times, or a sixtieth of the iterations if more."""
     until: float = 0.85
     """Share of the run after which it is not refined any more."""
     share: float = 0.08

@@ -98,7 +98,7 @@ def _arrays(path: Path, field: Field | None) -> dict[str, np.ndarray]:
         if path.suffix.lower() not in DIRECTIONAL_SUFFIXES:
             raise MeshError(
                 f"{path}: '{path.suffix}' holds no colours that depend on the direction (spherical harmonics); use "
-                f"{' or '.join(DIRECTIONAL_SUFFIXES)}, or save a field without harmonics."
+                f"{' or '.join(DIRECTIONAL_SUFFIXES)}, or save a field without harmonics (export --without-harmonics)."
             )
         arrays[HARMONICS] = _array(field.harmonics.flatten(1))
     return arrays
