@@ -197,3 +197,30 @@ def test_picture_is_seen_where_the_camera_says() -> None:
     rows, columns = np.nonzero(picture(pose)[..., 3])
     middle = project(pose, np.array([[0.3, -0.2, 0.1]]))[0]
     np.testing.assert_allclose([columns.mean() + 0.5, rows.mean() + 0.5], middle, atol=0.2)
+
+
+def test_scenes_in_geographic_coordinates_are_refused(tmp_path: Path) -> None:
+    write_transforms(tmp_path)
+
+    def far(content: dict) -> None:
+        for frame in content["frames"]:
+            frame["transform_matrix"][1][3] += 4e6
+
+    edit(tmp_path, far)
+    with pytest.raises(CaptureError, match="too far for single precision; subtract its centre") as error:
+        load_capture(tmp_path, bounds=(-1, 4e6 - 1, -1, 1, 4e6 + 1, 1))
+    check_sentence(error.value)
+
+
+def test_a_box_that_is_given_may_be_seen_by_few(tmp_path: Path) -> None:
+    write_transforms(tmp_path)
+    # Beside the ball: most cameras look past it.
+    box = (2.6, -0.3, 0.0, 2.8, -0.1, 0.2)
+    assert load_capture(tmp_path, bounds=box).bounds[0].tolist() == pytest.approx(box[:3])
+
+
+def test_one_training_view_is_too_few_to_find_the_scene(tmp_path: Path) -> None:
+    write_transforms(tmp_path, suffix=".jpg")
+    edit(tmp_path, lambda c: c.update(frames=c["frames"][:2]))
+    with pytest.raises(CaptureError, match=r"One training view .*test_every 0"):
+        load_capture(tmp_path)

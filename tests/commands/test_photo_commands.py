@@ -61,6 +61,26 @@ def test_large_photographs_are_shrunk_and_the_choices_can_be_fed_back(tmp_path, 
     assert cli.main(["fit", str(tmp_path / "ball"), "-o", str(out), "--resume"]) == 0
 
 
+def test_a_size_that_needs_no_shrinking_is_kept_for_other_machines(tmp_path, monkeypatch):
+    write_nerf_synthetic(tmp_path / "ball")
+    out, again = tmp_path / "out", tmp_path / "again"
+    assert cli.main(["fit", str(tmp_path / "ball"), "-o", str(out), *FIT]) == 0
+    monkeypatch.setattr("difftetvr.cli.options._LONGEST_SIDE", 30)
+    assert cli.main(["fit", "--config", str(out / "config.json"), "-o", str(again)]) == 0
+    assert (again / "model.vtu").read_bytes() == (out / "model.vtu").read_bytes()
+    assert cli.main(["fit", str(tmp_path / "ball"), "-o", str(out), "--resume", "--downscale", "1"]) == 0
+
+
+def test_models_with_harmonics_can_be_exported_without(tmp_path, capsys):
+    write_nerf_synthetic(tmp_path / "ball")
+    assert cli.main(["fit", str(tmp_path / "ball"), "-o", str(tmp_path / "out"), *FIT]) == 0
+    model = tmp_path / "out" / "model.vtu"
+    assert "--without-harmonics" in fails(capsys, "export", model, tmp_path / "model.msh")
+    assert cli.main(["export", str(model), str(tmp_path / "model.msh"), "--without-harmonics"]) == 0
+    assert "without harmonics" in capsys.readouterr().out
+    assert load(tmp_path / "model.msh")[1].harmonics is None
+
+
 def test_a_size_that_is_given_stays(tmp_path, monkeypatch):
     write_nerf_synthetic(tmp_path / "ball")
     monkeypatch.setattr("difftetvr.cli.options._LONGEST_SIDE", 30)
@@ -73,10 +93,11 @@ def test_a_start_that_the_images_do_not_allow(tmp_path, capsys):
     write_nerf_synthetic(tmp_path / "ball")
     write_colmap(tmp_path / "room")
     out = tmp_path / "out"
-    assert "has no points within its bounds" in fails(
-        capsys, "fit", tmp_path / "ball", "-o", out, *FIT, "--start", "points"
-    )
-    assert "Nothing tells" in fails(capsys, "fit", tmp_path / "room", "-o", out, *FIT, "--start", "hull")
+    fit = ("fit", "-o", out, *FIT)
+    assert "has no points within its bounds" in fails(capsys, *fit, tmp_path / "ball", "--start", "points")
+    assert "Nothing tells" in fails(capsys, *fit, tmp_path / "room", "--start", "hull")
+    small = ("--loss", "l1-ssim", "--downscale", "6")
+    assert "fewer than the 11 that SSIM" in fails(capsys, *fit, tmp_path / "ball", *small)
     assert not out.exists()
 
 

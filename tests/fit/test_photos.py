@@ -144,3 +144,24 @@ def test_sparsity_empties_fog(shiny: dtv.Capture) -> None:
 def test_bad_options(option: dict[str, float]) -> None:
     with pytest.raises(dtv.FitError, match=f"^The option {next(iter(option))} is "):
         dtv.FitConfig(**option)  # type: ignore[arg-type]
+
+
+def test_masked_pixels_do_not_dilute_errors(shiny: dtv.Capture) -> None:
+    """Nor do they dilute the errors of the others; views without any other pixel are left out."""
+    valid = torch.zeros(24, 24, 24, dtype=torch.bool)
+    valid[:, :, :3] = True
+    masked = dataclasses.replace(shiny, valid=valid)
+    cropped = dataclasses.replace(
+        shiny,
+        cameras=[dataclasses.replace(c, width=3) for c in shiny.cameras],
+        images=shiny.images[:, :, :3].contiguous(),
+        alphas=shiny.alphas[:, :, :3].contiguous(),
+    )
+    options = {"iterations": 3, "start": "grid", "haze_penalty": 0.0, "refine": "none", "background": "white"}
+    config = dtv.FitConfig(**FAST | options)
+    ours, theirs = (dtv.fit(capture, config) for capture in (masked, cropped))
+    torch.testing.assert_close(torch.tensor(ours.history.loss), torch.tensor(theirs.history.loss))
+    assert ours.metrics["train_psnr"] == pytest.approx(theirs.metrics["train_psnr"], abs=1e-3)
+    assert ours.metrics["psnr"] == pytest.approx(theirs.metrics["psnr"], abs=1e-3)
+    blank = valid & (torch.arange(24) > 0)[:, None, None]
+    assert dtv.fit(dataclasses.replace(shiny, valid=blank), config).evaluation.views == [6, 12, 18]
