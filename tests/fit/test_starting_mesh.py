@@ -186,7 +186,8 @@ def test_bisecting_where_units_differ_changes_nothing(room: dtv.Capture) -> None
 def test_a_few_transparent_pixels_are_no_silhouette(ball: dtv.Capture) -> None:
     corner = torch.ones_like(ball.alphas)
     corner[:, :4, :4] = 0.0  # as undistorted photographs have
-    assert dataclasses.replace(ball, alphas=corner).silhouettes is None
+    photo = dataclasses.replace(ball, alphas=corner)
+    assert photo.silhouettes is None and dtv.FitConfig().for_capture(photo).background == "black"
     # Held-out views have no say.
     held_out = torch.where(ball.test[:, None, None], torch.zeros(()), torch.ones_like(ball.alphas))
     assert dataclasses.replace(ball, alphas=held_out).silhouettes is None

@@ -197,6 +197,11 @@ class Capture:
         """
         return silhouettes(self.images, self.alphas, self.train_indices.tolist())
 
+    @property
+    def is_cut_out(self) -> bool:
+        """Whether alpha tells the object from its background."""
+        return self.alphas is not None and self.silhouettes is not None
+
     def save(self, path: str | Path) -> None:
         """Write the capture to one ``.npz`` file, which :meth:`load` reads back to the bit.
 

@@ -33,7 +33,7 @@ class Eval:
     all_views: bool = False
     """Compare with the training views, too."""
     background: tuple[float, float, float] | None = None
-    """R G B behind the volume; default: white for photographs with alpha, else black."""
+    """R G B behind the volume; default: white for photographs that alpha cuts out, else black."""
     device: str | None = None
     """Where to render."""
     views_of: OmitArgPrefixes[CaptureOptions] = field(default_factory=CaptureOptions)

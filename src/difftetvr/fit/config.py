@@ -127,7 +127,7 @@ class FitConfig:
     """Decay of Adam's first and second moments."""
     background: Background | None = None
     """Behind the volume: black, white, random in every step (white where images are compared), or R G B. All but black
-    need images with alpha. Default: random for photographs with alpha, else black."""
+    need images with alpha. Default: random for photographs that alpha cuts out, else black."""
     haze_penalty: float = 0.01
     """Pull towards zero density, in mean absolute density gradients; removes fog that no training view can refute."""
     sparsity: float = 0.0
@@ -218,7 +218,7 @@ class FitConfig:
             "cells": max(_DEFAULT_CELLS, min(pixels // _PHOTO_PIXELS_PER_CELL, _MOST_PHOTO_CELLS)),
             "start": without_silhouettes if capture.silhouettes is None else "hull",
             "iterations": _PHOTO_ITERATIONS,
-            "background": "black" if capture.alphas is None else "random",
+            "background": "random" if capture.is_cut_out else "black",
             "harmonics": _PHOTO_BANDS,
         }
 

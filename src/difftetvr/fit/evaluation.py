@@ -57,8 +57,8 @@ class Evaluation:
 
 
 def usual_background(capture: Capture) -> Color:
-    """What held-out views are compared over where nobody says: white for photographs with alpha, else black."""
-    return WHITE if capture.encoding == "srgb" and capture.alphas is not None else BLACK
+    """What held-out views are compared over where nobody says: white for photographs that alpha cuts out, else black."""
+    return WHITE if capture.encoding == "srgb" and capture.is_cut_out else BLACK
 
 
 def true_image(capture: Capture, view: int, background: Color = BLACK) -> torch.Tensor:
