@@ -57,7 +57,7 @@ class Evaluation:
 
 
 def usual_background(capture: Capture) -> Color:
-    """What held-out views are compared over where nobody says: white for photographs that alpha cuts out, else black."""
+    """What held-out views are compared over by default: white for photographs that alpha cuts out, else black."""
     return WHITE if capture.encoding == "srgb" and capture.is_cut_out else BLACK
 
 
