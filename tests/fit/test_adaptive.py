@@ -168,8 +168,8 @@ def test_flips_alone_keep_the_budget(small_capture):
 
 
 def test_a_device_without_double_precision_is_one_sentence(small_capture, monkeypatch):
-    trainer = importlib.import_module("difftetvr.fit.trainer")
-    monkeypatch.setattr(trainer, "_WITHOUT_DOUBLES", ("cpu",))
+    requirements = importlib.import_module("difftetvr.fit.requirements")
+    monkeypatch.setattr(requirements, "_WITHOUT_DOUBLES", ("cpu",))
     with pytest.raises(FitError, match=r"double precision, which cpu lacks; use the device cpu, or neither move"):
         Trainer(small_capture, SHORT)
     Trainer(small_capture, dataclasses.replace(SHORT, move=False, refine="none"))

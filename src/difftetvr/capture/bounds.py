@@ -116,11 +116,11 @@ def require_seen(bounds: Floats, cameras: Sequence[Camera], name: str, most_blin
     """Checks that enough cameras see something of the box.
 
     Raises:
-        CaptureError: More than a share ``most_blind`` of them, or all, see nothing of it.
+        CaptureError: More than a share ``most_blind`` of them see nothing of it.
     """
     points = _cell_centers(bounds, _COARSE_GRID)
     blind = [camera for camera in cameras if not in_image(*project(points, camera), camera).any()]
-    if len(blind) > most_blind * len(cameras) or len(blind) == len(cameras):
+    if len(blind) > most_blind * len(cameras):
         lower, upper = (np.array2string(corner, precision=3) for corner in bounds)
         raise CaptureError(
             f"{len(blind)} of the {len(cameras)} cameras of '{name}' see nothing of the scene's box {lower} to "

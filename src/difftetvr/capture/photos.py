@@ -171,7 +171,7 @@ class PhotoCapture:
         surroundings = 1.0
         if np.isfinite(box).all() and (box[0] < box[1]).all():
             # A box that is given may be of something that few cameras look at.
-            require_seen(box, seeing, photo_set.name, most_blind=0.5 if self.bounds is None else 1.0)
+            require_seen(box, seeing, photo_set.name, most_blind=0.5 if self.bounds is None else 0.75)
             require_resolved(box, photo_set.name)
             surroundings = 1.0 if masks is not None else surroundings_of(box, seeing)
         return torch.from_numpy(box.astype(np.float32)), surroundings
