@@ -1,5 +1,7 @@
 """Cuts through meshes, and sheets that compare models."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -96,3 +98,15 @@ def test_curves_gain_a_plot_of_predicted_and_achieved_gains(tmp_path):
     save_curves(tmp_path / "gains.png", history)
     plain, gains = (Image.open(tmp_path / name) for name in ("plain.png", "gains.png"))
     assert gains.width == 1.5 * plain.width
+
+
+def test_views_without_valid_pixels_are_not_compared(capture):
+    tested = capture.test_indices.tolist()
+    valid = torch.ones(capture.images.shape[:3], dtype=torch.bool)
+    valid[tested[-1]] = False
+    masked = dataclasses.replace(capture, valid=valid)
+    mesh = TetMesh.grid((2, 2, 2), *capture.bounds.tolist())
+    field = Field(torch.full((mesh.num_vertices, 3), 0.5), torch.ones(mesh.num_vertices))
+    models = [Model("grey", mesh, field)]
+    all_rows, fewer = (compare_models(views, models, rows=99).height for views in (capture, masked))
+    assert fewer < all_rows

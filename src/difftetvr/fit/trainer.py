@@ -264,7 +264,7 @@ class Trainer:
             self.parameters.add(refinement.surplus, self.capture.density_unit)
 
     def _model(self, views: Sequence[int]) -> ImageModel:
-        """Mean over views of the quadratic models of the squared error, in the parameters' units."""
+        """Mean over views of the quadratic models of the squared error, densities in the capture's unit."""
         field = self.parameters.detached_field()
         background = self.config.background_at(self.iteration)
         deterministic = self.config.deterministic
@@ -282,6 +282,10 @@ class Trainer:
         )
         return reduce(add, models).scaled(1.0 / len(views)).with_density_unit(self.capture.density_unit)
 
+    def _share(self, view: int) -> float:
+        """Share of a view's pixels that count, by which means over all pixels are divided; never 0."""
+        return max(valid_share(self.capture, view), _LEAST_SHARE)
+
     def _error(self, views: Sequence[int]) -> float:
         """Mean squared error over views."""
         field = self.parameters.detached_field()
@@ -291,7 +295,7 @@ class Trainer:
             truth = true_image(self.capture, view, background)
             image = rendered_image(self.mesh, field, self.capture, view, background)
             squares = (where_valid(self.capture, view, image, truth) - truth).square()
-            errors.append(float(squares.mean()) / max(valid_share(self.capture, view), _LEAST_SHARE))
+            errors.append(float(squares.mean()) / self._share(view))
         return sum(errors) / len(errors)
 
     def _color_gradients(self) -> torch.Tensor:
@@ -320,7 +324,7 @@ class Trainer:
             deterministic=self.config.deterministic,
         ).color
         image = where_valid(self.capture, view, image, truth)
-        share = max(valid_share(self.capture, view), _LEAST_SHARE)
+        share = self._share(view)
         loss = LOSSES[self.config.loss](image, truth) / share
         if self.config.sparsity:
             loss = loss + self.config.sparsity * sparsity(self.parameters.density)

@@ -8,7 +8,7 @@ from PIL import Image, ImageOps
 
 from difftetvr.capture.capture import Capture
 from difftetvr.errors import CaptureError, counted
-from difftetvr.fit.evaluation import Evaluation, evaluate, rendered_image, true_image, usual_background
+from difftetvr.fit.evaluation import Evaluation, evaluate, rendered_image, true_image, usual_background, valid_share
 from difftetvr.mesh.field import Field
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.view.cut import Plane, cut_picture
@@ -36,10 +36,10 @@ def compare_models(capture: Capture, models: list[Model], rows: int = 1, plane: 
         plane: Adds a row of cuts along it through every model; the last one's is shown without cells, too. None: none.
 
     Raises:
-        CaptureError: The capture holds out no views, or rows is less than 1.
+        CaptureError: The capture holds out no views with valid pixels, or rows is less than 1.
         MeshError: The plane misses a mesh.
     """
-    tested = capture.test_indices.tolist()
+    tested = [view for view in capture.test_indices.tolist() if valid_share(capture, view) > 0.0]
     if not tested or rows < 1:
         held_out = counted(len(tested), "view")
         raise CaptureError(f"'{capture.name}' holds out {held_out}, of which to show {rows}; show at least 1.")
