@@ -52,7 +52,7 @@ def test_what_is_left_open_is_chosen_for_the_images(shiny: dtv.Capture) -> None:
     assert dtv.FitConfig().for_capture(opaque).background == "black"
     light = dataclasses.replace(shiny, encoding="linear")
     assert (light.encoding, dtv.FitConfig().for_capture(light).harmonics) == ("linear", 0)
-    given = dtv.FitConfig(background="white", harmonics=0, cells=500, start="grid", iterations=9)
+    given = dtv.FitConfig(background="white", harmonics=0, cells=500, start="grid", iterations=9, free_space=0.1)
     assert given.for_capture(shiny) == given
     assert dtv.FitConfig.from_json(chosen.to_json()) == chosen
 
@@ -73,8 +73,54 @@ def test_bands_are_switched_on_one_after_the_other() -> None:
     assert dtv.FitConfig(iterations=100, harmonics=0).bands_at(99) == 0
 
 
-def test_resuming_with_harmonics_gives_the_same_bits(shiny: dtv.Capture, tmp_path) -> None:  # type: ignore[no-untyped-def]
-    options = FAST | {"iterations": 30, "exchange": Exchange(rounds=3)}
+@pytest.fixture(scope="module")
+def room(shiny: dtv.Capture) -> dtv.Capture:
+    """The same views, taken through fog that is a little different before each camera, and without alpha."""
+    fog = 0.1 + 0.3 * torch.rand(len(shiny.cameras), 1, 1, 3, generator=torch.Generator().manual_seed(1))
+    return dataclasses.replace(shiny, images=0.7 * shiny.images + 0.3 * fog, alphas=None, surroundings=9.0)
+
+
+@pytest.mark.parametrize("start", ["grid", "points"])
+def test_nothing_is_put_before_the_cameras(room: dtv.Capture, start: str) -> None:
+    points = torch.nn.functional.normalize(torch.randn(200, 3, generator=torch.Generator().manual_seed(2)), dim=1)
+    capture = dataclasses.replace(room, points=0.9 * points)
+    options = FAST | {"cells": 4000, "iterations": 60, "start": start, "exchange": Exchange(rounds=6, until=0.5)}
+    config = dtv.FitConfig(**options, harmonics=0)
+    assert config.for_capture(capture).free_space == 0.8
+    assert config.for_capture(dataclasses.replace(capture, surroundings=1.0)).free_space == 0.0
+    trainer = Trainer(capture, config)
+    space = capture.free_space(0.8)
+    for _ in range(60):
+        due = trainer.strategy.is_due(trainer._moment())
+        trainer.step()
+        if due:
+            is_free = trainer.parameters.is_free
+            assert (space.contains(trainer.mesh.vertices) == is_free).float().mean() > 0.99  # one step later
+    is_free = trainer.parameters.is_free
+    assert int(is_free.sum()) > 30 and trainer.history.refinements
+    assert (trainer.parameters.detached_field().density[is_free] == 0.0).all()
+    foggy = dtv.fit(capture, dataclasses.replace(config, free_space=0.0))
+    assert float(foggy.field.density[space.contains(foggy.mesh.vertices)].mean()) > 0.0
+
+
+def test_free_space_lies_before_the_training_cameras(room: dtv.Capture) -> None:
+    space = room.free_space(0.5)
+    assert space.cameras == [room.cameras[view] for view in room.train_indices.tolist()]
+    beyond = dataclasses.replace(room, points=torch.full((1, 3), 1e6))
+    assert beyond.free_space(0.5).reaches == space.reaches
+
+
+def test_free_space_empties_an_initial_field(room: dtv.Capture) -> None:
+    mesh = dtv.TetMesh.grid((6, 6, 6), (-5, -5, -5), (5, 5, 5))
+    trainer = Trainer(room, dtv.FitConfig(**FAST, harmonics=0), mesh)
+    is_free = room.free_space(0.8).contains(mesh.vertices)
+    assert is_free.any() and ((trainer.parameters.density == 0.0) == is_free).all()
+
+
+@pytest.mark.parametrize("name", ["shiny", "room"])
+def test_resuming_gives_the_same_bits(name: str, tmp_path, request) -> None:  # type: ignore[no-untyped-def]
+    capture = request.getfixturevalue(name)
+    options = FAST | {"cells": 4000, "iterations": 30, "exchange": Exchange(rounds=3)}
     config = dtv.FitConfig(harmonics=2, **options)
 
     def advance(trainer: Trainer, count: int) -> Trainer:
@@ -82,13 +128,14 @@ def test_resuming_with_harmonics_gives_the_same_bits(shiny: dtv.Capture, tmp_pat
             trainer.step()
         return trainer
 
-    whole = advance(Trainer(shiny, config), 30)
+    whole = advance(Trainer(capture, config), 30)
     assert whole.history.refinements
-    half = advance(Trainer(shiny, config), 14)
+    half = advance(Trainer(capture, config), 14)
     half.checkpoint().save(tmp_path / "half.safetensors")
-    again = advance(Trainer.resume(shiny, config, Checkpoint.load(tmp_path / "half.safetensors")), 16)
+    again = advance(Trainer.resume(capture, config, Checkpoint.load(tmp_path / "half.safetensors")), 16)
     expected, found = whole.checkpoint().tensors, again.checkpoint().tensors
     assert expected.keys() == found.keys() and "harmonics.exp_avg" in expected
+    assert bool(expected["is_free"].any()) == (name == "room")
     for name, tensor in expected.items():
         assert torch.equal(tensor, found[name]), name
 

@@ -5,6 +5,7 @@ import dataclasses
 import pytest
 import torch
 
+from difftetvr.capture.free_space import FreeSpace
 from difftetvr.fit import FitError
 from difftetvr.fit.refinement import Exchange, Grow, Moment, Situation, Star
 from difftetvr.fit.refinement.gains import bisection_gains, collapse_costs, edges_before, flip_gains
@@ -15,6 +16,7 @@ from difftetvr.mesh.locate import locate
 from difftetvr.render import Camera, render
 from difftetvr.render.gauss_newton import model_image
 
+NOWHERE = FreeSpace([], [])
 CAMERA = Camera.look_at(eye=(0.4, -1.6, 0.9), target=(0.5, 0.5, 0.5), up=(0, 0, 1), width=48, height=48)
 
 
@@ -56,10 +58,11 @@ def error_of(mesh, values, truth):
     return float((image_of(mesh, values) - truth).square().mean())
 
 
-def situation_of(scene, budget=None, iteration=100):
+def situation_of(scene, budget=None, iteration=100, free_space=NOWHERE):
     mesh, values, _, model = scene
     moment = Moment(iteration, 1000, 10, mesh.num_cells, budget or mesh.num_cells)
-    return Situation(mesh, values, moment, lambda: model, lambda: torch.linspace(0, 1, mesh.num_vertices))
+    gradients = torch.linspace(0, 1, mesh.num_vertices)
+    return Situation(mesh, values, moment, lambda: model, lambda: gradients, free_space)
 
 
 def everything(mesh):
@@ -204,20 +207,38 @@ def test_flip_gains_are_those_of_real_flips(scene):
     assert 0.6 < float(achieved[:25].sum() / predicted[:25].sum()) < 1.4
 
 
-def test_bisections_win_what_is_predicted(scene):
+@pytest.mark.parametrize(("stays_empty", "start"), [(False, 1.0), (True, 1.0), (True, 0.6)])
+def test_bisections_win_what_is_predicted(scene, stays_empty, start):
     mesh, values, truth, model = scene
-    gains = bisection_gains(mesh, values, model.edges)
+    is_free = torch.full((len(mesh.topology.edges),), stays_empty)
+    gains = bisection_gains(mesh, values, model.edges, is_free, start)
     before = error_of(mesh, values, truth)
-    best = gains.gain.argsort(descending=True)[:12]
+    best = gains.start_gain.argsort(descending=True)[:12]
     achieved = 0.0
     for edge in best.tolist():
         change = bisect_edges(mesh, torch.tensor([edge]))
         finer = change.carry(values) + change.is_new[:, None] * gains.start[edge]
         assert ((finer[:, :3] >= -1e-12) & (finer[:, :3] <= 1 + 1e-12)).all() and (finer[:, 3] >= -1e-12).all()
+        assert not stays_empty or (finer[change.is_new, 3].abs() < 1e-12).all()
         won = before - error_of(change.mesh, finer.clamp_min(0.0), truth)
         assert won > 0
         achieved += won
-    assert achieved == pytest.approx(float(gains.gain[best].sum()), rel=0.3)
+    assert achieved == pytest.approx(float(gains.start_gain[best].sum()), rel=0.3)
+
+
+def test_exchange_leaves_free_space_alone(scene):
+    mesh, values, truth, model = scene
+    # The half of the scene that is nearer to the camera.
+    space = FreeSpace([Camera.look_at((5.0, 0.5, 0.5), (0.0, 0.5, 0.5), width=8, height=8)], [4.5])
+    values = values.clone()
+    values[space.contains(mesh.vertices), 3] = 0.0
+    situation = situation_of((mesh, values, truth, model), 2 * mesh.num_cells, free_space=space)
+    refinement = Exchange(flips=False).refine(situation)
+    added = refinement.changes[-1].is_new
+    positions = refinement.changes[-1].mesh.vertices[added]
+    density = applied(values, refinement)[added, 3]
+    is_free = space.contains(positions)
+    assert is_free.any() and (density[is_free].abs() < 1e-12).all() and (density[~is_free] > 0.0).any()
 
 
 def test_edges_before_a_change(scene):

@@ -11,6 +11,7 @@ from typing import Literal, get_args
 import torch
 
 from difftetvr.capture.capture_file import read_capture, write_capture
+from difftetvr.capture.free_space import FreeSpace
 from difftetvr.capture.hull import silhouettes
 from difftetvr.capture.packed import PackedImages
 from difftetvr.errors import CaptureError
@@ -179,6 +180,15 @@ class Capture:
         lower, upper = self.bounds.to(points)
         distance = (2.0 * points - lower - upper).abs() / (upper - lower)
         return self.density_unit / distance.amax(1).clamp_min(1.0)
+
+    def free_space(self, share: float) -> FreeSpace:
+        """Where nothing is, in front of the training cameras.
+
+        Args:
+            share: Share of the way from a camera to the scene, in [0, 1).
+        """
+        cameras = [self.cameras[view] for view in self.train_indices.tolist()]
+        return FreeSpace.of(cameras, self.bounds, self.scene_points, share)
 
     @property
     def scene_points(self) -> torch.Tensor | None:

@@ -119,7 +119,7 @@ def _print_choices(console: Console, given: FitConfig, chosen: FitConfig) -> Non
     if (given.initial_mesh or given.grid) and given.refine != "grow":
         unused.add("cells")
     left_open = [name for name in CHOSEN_FOR_CAPTURE if getattr(given, name) is None and name not in unused]
-    choices = [f"--{name} {getattr(chosen, name)}" for name in left_open]
+    choices = [f"--{name.replace('_', '-')} {getattr(chosen, name)}" for name in left_open]
     if choices:
         console.print(f"Chosen for these images: {', '.join(choices)}", highlight=False)
 

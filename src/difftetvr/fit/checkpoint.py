@@ -26,7 +26,7 @@ from difftetvr.fit.errors import FitError
 from difftetvr.fit.history import History
 from difftetvr.mesh.tetmesh import TetMesh
 
-_VERSION = 4
+_VERSION = 5
 _HISTORY = ("history.loss", "history.psnr")
 
 

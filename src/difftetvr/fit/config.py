@@ -39,6 +39,7 @@ _STARTS = ("grid", "hull", "points")
 _DEFAULT_CELLS, _DEFAULT_ITERATIONS = 20_000, 2400
 _PHOTO_BANDS, _PHOTO_ITERATIONS = 2, 4800
 _PHOTO_PIXELS_PER_CELL = 12
+_PHOTO_FREE_SPACE = 0.8
 _MOST_PHOTO_CELLS = 1_000_000
 _BAND_SHARE = 0.05  # of the run, from one band of harmonics to the next
 _STRATEGIES = ("exchange", "grow", "star", "none")
@@ -48,6 +49,7 @@ _CHOICES_FOR_VOLUMES: dict[str, Any] = {
     "iterations": _DEFAULT_ITERATIONS,
     "background": "black",
     "harmonics": 0,
+    "free_space": 0.0,
 }
 CHOSEN_FOR_CAPTURE = tuple(_CHOICES_FOR_VOLUMES)
 """Options whose default depends on the images."""
@@ -130,6 +132,9 @@ class FitConfig:
     need images with alpha. Default: random for photographs that alpha cuts out, else black."""
     haze_penalty: float = 0.01
     """Pull towards zero density, in mean absolute density gradients; removes fog that no training view can refute."""
+    free_space: float | None = None
+    """Share of the way from each training camera to the scene that is kept empty, in a cone wider than its view: to the
+    capture's bounds, or to sparse points that are nearer. Default: 0.8 for photographs with a background, else 0."""
     sparsity: float = 0.0
     """Weight of a loss that favours few opaque places over much fog: the mean over vertices of log(1 + 2 density^2)."""
     initial_color: float = 0.5
@@ -167,6 +172,8 @@ class FitConfig:
             require(value >= 0 and math.isfinite(value), name, value, "at least 0 and finite")
         require(0 <= self.initial_color <= 1, "initial_color", self.initial_color, "between 0 and 1")
         require(all(0 <= b < 1 for b in self.betas), "betas", self.betas, "at least 0 and less than 1")
+        share = self.free_space
+        require(share is None or 0 <= share < 1, "free_space", share, "at least 0 and below 1")
         require(self.location in ("vertex", "cell"), "location", self.location, "vertex or cell")
         require(self.loss in _LOSSES, "loss", self.loss, f"one of {', '.join(_LOSSES)}")
         bands = self.harmonics
@@ -220,6 +227,7 @@ class FitConfig:
             "iterations": _PHOTO_ITERATIONS,
             "background": "random" if capture.is_cut_out else "black",
             "harmonics": _PHOTO_BANDS,
+            "free_space": _PHOTO_FREE_SPACE if capture.surroundings > 1.0 else 0.0,
         }
 
     def bands_at(self, iteration: int) -> int:

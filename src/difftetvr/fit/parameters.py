@@ -21,14 +21,15 @@ class FieldParameters:
     """Colours and densities on a mesh, directional colours too if wanted, with their Adam optimiser.
 
     Density is stored in units of the capture's typical density, so that one learning rate fits scenes of any size.
-    After each step the parameters are projected to the valid ranges, colours to [0, 1] and densities to [0, inf):
-    unlike under an exponential or softplus, empty space reaches a density of exactly 0.
+    After each step the parameters are projected to the valid ranges, colours to [0, 1] and densities to [0, inf), or to
+    0 where nothing can be: unlike under an exponential or softplus, empty space reaches a density of exactly 0.
 
     Attributes:
         color: (N, 3) leaf tensor, linear RGB; N vertices or cells.
         density: (N,) leaf tensor in units of ``density_unit``.
         harmonics: (N, B, 3) leaf tensor, coefficients of the directional part of the colours; None without it.
         density_unit: (N,) densities per unit length that parameters of 1 stand for.
+        is_free: (N,) bool, where nothing can be: densities stay 0.
         location: ``"vertex"`` or ``"cell"``, what the N entries belong to.
     """
 
@@ -47,6 +48,7 @@ class FieldParameters:
         device = mesh.vertices.device
         self.location = config.location
         self.density_unit = density_unit.to(device, torch.float32)
+        self.is_free = torch.zeros(count, dtype=torch.bool, device=device)
         color = torch.full((count, 3), config.initial_color, device=device)
         density = torch.full((count,), config.initial_density, device=device)
         if initial is not None:
@@ -99,7 +101,8 @@ class FieldParameters:
         """Follows a change of the mesh, for parameters on vertices.
 
         Kept vertices keep their values and moments. New ones start with interpolated values at rest: first moment 0,
-        second moment the mean of the ends of the edge they lie on. The count of steps goes on for all.
+        second moment the mean of the ends of the edge they lie on. The count of steps goes on for all. None of the new
+        ones is known to be free.
 
         Args:
             change: What was done to the mesh.
@@ -108,6 +111,7 @@ class FieldParameters:
         # Where units differ, densities are what is linear along edges.
         density = change.carry(self.density_unit * self.density.detach()) / unit
         self.density_unit = unit
+        self.is_free = self.is_free[change.parents[:, 0].long()] & ~change.is_new
         for name, parameter in list(self._items()):
             state = self._optimizer.state.pop(parameter)
             first = change.carry(state[_FIRST])
@@ -120,6 +124,15 @@ class FieldParameters:
             setattr(self, name, carried)
         for group, parameters in zip(self._optimizer.param_groups, self._groups()):
             group["params"] = parameters
+
+    def keep_free(self, is_free: torch.Tensor) -> None:
+        """Makes the field empty where nothing can be, now and after all further steps.
+
+        Args:
+            is_free: (N,) bool.
+        """
+        self.is_free = is_free
+        self._project()
 
     def add(self, surplus: torch.Tensor, unit: float) -> None:
         """Changes the field, and projects it to the valid ranges.
@@ -154,7 +167,7 @@ class FieldParameters:
 
     def state(self) -> dict[str, torch.Tensor]:
         """Parameters and optimiser state by name: all that the next step depends on."""
-        tensors = {**dict(self._items()), "density_unit": self.density_unit}
+        tensors = {**dict(self._items()), "density_unit": self.density_unit, "is_free": self.is_free}
         for name, parameter in self._items():
             for key, value in self._optimizer.state[parameter].items():
                 tensors[f"{name}.{key}"] = value
@@ -173,7 +186,7 @@ class FieldParameters:
     def _project(self) -> None:
         with torch.no_grad():
             self.color.clamp_(0.0, 1.0)
-            self.density.clamp_(min=0.0)
+            self.density.clamp_(min=0.0).masked_fill_(self.is_free, 0.0)
 
     def _groups(self) -> list[list[torch.Tensor]]:
         """Parameters that share a learning rate."""

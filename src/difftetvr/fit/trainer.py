@@ -83,6 +83,8 @@ class Trainer:
         self.budget = self._budget(mesh is not None or config.grid is not None or config.initial_mesh is not None)
         units = capture.density_units_at(self._sites())
         self.parameters = FieldParameters(self._mesh, config, units, start.field)
+        self._free_space = capture.free_space(config.free_space or 0.0)
+        self.parameters.keep_free(self._free_space.contains(self._sites()))
         self.positions = VertexOptimizer(self._mesh, config.motion) if config.move else None
         self.iteration = 0
         self.history = History()
@@ -233,7 +235,7 @@ class Trainer:
         mesh = self.mesh
         values = self.parameters.values(self.capture.density_unit)
         refinement = self.strategy.refine(
-            Situation(mesh, values, self._moment(), lambda: self._model(views), self._color_gradients)
+            Situation(mesh, values, self._moment(), lambda: self._model(views), self._color_gradients, self._free_space)
         )
         if refinement is None:
             return
@@ -260,6 +262,8 @@ class Trainer:
             if self.positions:
                 self.positions.carry(change)
             self._mesh = change.mesh
+        # Also those that have moved there since.
+        self.parameters.keep_free(self._free_space.contains(self._sites()))
         if refinement.surplus is not None:
             self.parameters.add(refinement.surplus, self.capture.density_unit)
 

@@ -94,7 +94,7 @@ class Exchange(OptionGroup):
     def refine(self, situation: Situation) -> Refinement | None:
         """See `Strategy.refine`."""
         model, target = situation.model(), self.target(situation.moment)
-        exchange = _Exchange(situation.mesh, situation.values, model, self)
+        exchange = _Exchange(situation, model, self)
         if self.flips:
             exchange.flip(model, target, self)
         if self.share:
@@ -127,10 +127,12 @@ class Grow(Exchange):
 class _Exchange:
     """One round: the mesh so far, and what is known about its edges."""
 
-    def __init__(self, mesh: TetMesh, values: torch.Tensor, model: ImageModel, options: Exchange) -> None:
-        self.mesh = mesh
-        self.values = values.to(model.edges.gradient.dtype)
-        self.gains = bisection_gains(mesh, self.values, model.edges, options.start)
+    def __init__(self, situation: Situation, model: ImageModel, options: Exchange) -> None:
+        self.mesh = situation.mesh
+        self.values = situation.values.to(model.edges.gradient.dtype)
+        middles = self.mesh.vertices[self.mesh.topology.edges.long()].mean(1)
+        is_free = situation.free_space.contains(middles)
+        self.gains = bisection_gains(self.mesh, self.values, model.edges, is_free, options.start)
         self.surplus: torch.Tensor | None = None
         self.changes: list[MeshChange] = []
         self.predicted = 0.0

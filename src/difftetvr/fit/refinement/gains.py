@@ -47,20 +47,26 @@ class BisectionGains:
         )
 
 
-def bisection_gains(mesh: TetMesh, values: torch.Tensor, edges: HatDerivatives, start: float = 1.0) -> BisectionGains:
+def bisection_gains(
+    mesh: TetMesh, values: torch.Tensor, edges: HatDerivatives, is_free: torch.Tensor, start: float = 1.0
+) -> BisectionGains:
     """Predicts what bisecting each edge would win.
 
     Args:
         mesh: The mesh.
         values: (V, 4) parameters.
         edges: Derivatives by the hats of ``mesh.topology.edges``.
+        is_free: (E,) bool, whose new vertices have to have density 0.
         start: Part of the best surplus that new vertices start with.
     """
     ends = mesh.topology.edges.long()
     middle = values[ends].mean(1)
-    upper = torch.cat((1.0 - middle[:, :3], torch.full_like(middle[:, 3:], torch.inf)), 1)
+    most = torch.where(is_free, -middle[:, 3], torch.inf)
+    upper = torch.cat((1.0 - middle[:, :3], most[:, None]), 1)
     best = edges.best_step(-middle, upper, _DAMPING)
-    return BisectionGains(edges.decrease(best).clamp_min(0.0), edges.decrease(start * best), start * best)
+    first = start * best
+    first[:, 3] = torch.where(is_free, most, first[:, 3])
+    return BisectionGains(edges.decrease(best).clamp_min(0.0), edges.decrease(first), first)
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from typing import Protocol
 
 import torch
 
+from difftetvr.capture.free_space import FreeSpace
 from difftetvr.mesh.change import MeshChange
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.render.gauss_newton import ImageModel
@@ -49,6 +50,7 @@ class Situation:
             ``values``.
         color_gradients: The sum over all training views of the absolute derivatives of the loss with respect to
             each vertex's colour, (V,).
+        free_space: Where densities stay 0.
     """
 
     mesh: TetMesh
@@ -56,6 +58,7 @@ class Situation:
     moment: Moment
     model: Callable[[], ImageModel]
     color_gradients: Callable[[], torch.Tensor]
+    free_space: FreeSpace
 
 
 @dataclass(frozen=True)

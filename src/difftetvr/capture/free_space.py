@@ -1,0 +1,71 @@
+"""Where nothing is: the space before the cameras, which they could not see through otherwise."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from difftetvr.capture.viewing import Floats, in_image, positions_of, project
+from difftetvr.render.camera import Camera
+
+_NEAREST = 1.0  # percent of the points of an image: fewer that are nearer are matched wrongly
+_BESIDE = 0.5  # of the image's longer side, to all sides: other views look through what is next to a view
+
+
+@dataclass(frozen=True, eq=False)
+class FreeSpace:
+    """Space that is known to be empty: in front of each camera, in a cone that is wider than its view.
+
+    Photographs that are few say little about what is near their cameras, where hardly two of them see the same place:
+    whatever fog a reconstruction puts there for the sake of one of them hides the scene from all other directions. But
+    whoever takes photographs of a scene sees to it that nothing is in between.
+
+    Attributes:
+        cameras: The cameras.
+        reaches: How far from each nothing is, in world units.
+    """
+
+    cameras: list[Camera]
+    reaches: list[float]
+
+    @staticmethod
+    def of(cameras: Sequence[Camera], bounds: torch.Tensor, points: torch.Tensor | None, share: float) -> FreeSpace:
+        """A share of the way to what is nearest, be it the scene's box or the points that a camera sees.
+
+        Args:
+            cameras: N cameras; nothing is free before those within the bounds.
+            bounds: (2, 3) corners of the scene's box.
+            points: (P, 3) points on surfaces, or None. Each image does without the nearest hundredth of its points.
+            share: Share of the way, in [0, 1).
+        """
+        places = None if points is None else points.double().numpy()
+        nearest = [_nearest(camera, bounds.double().numpy(), places) for camera in cameras] if share else []
+        free = [(camera, share * distance) for camera, distance in zip(cameras, nearest) if distance > 0.0]
+        return FreeSpace([camera for camera, _ in free], [reach for _, reach in free])
+
+    def contains(self, places: torch.Tensor) -> torch.Tensor:
+        """(N,) bool, which of (N, 3) places are empty."""
+        found = torch.zeros(len(places), dtype=torch.bool, device=places.device)
+        for camera, reach in zip(self.cameras, self.reaches, strict=True):
+            local = camera.to_camera_space(places)
+            depth, margin = local[:, 2], _BESIDE * max(camera.width, camera.height)
+            # Pixels times depth, which are finite also beside the camera.
+            x, y = (camera.fx * local[:, 0] + camera.cx * depth, camera.fy * local[:, 1] + camera.cy * depth)
+            within = (x > -margin * depth) & (x < (camera.width + margin) * depth)
+            within &= (y > -margin * depth) & (y < (camera.height + margin) * depth)
+            found |= within & (depth > 0.0) & (torch.linalg.vector_norm(local, dim=1) < reach)
+        return found
+
+
+def _nearest(camera: Camera, bounds: Floats, points: Floats | None) -> float:
+    """Distance of a camera from what it sees of the scene at least, 0 within the bounds."""
+    position = positions_of([camera])[0]
+    distance = float(np.linalg.norm(position - position.clip(*bounds)))
+    if points is not None:
+        seen = points[in_image(*project(points, camera), camera)]
+        if len(seen):
+            distance = min(distance, float(np.percentile(np.linalg.norm(seen - position, axis=1), _NEAREST)))
+    return distance
