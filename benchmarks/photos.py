@@ -27,6 +27,7 @@ ROWS: dict[str, dict[str, Any]] = {
     "l1-ssim": {"loss": "l1-ssim"},
     "start-grid": {"start": "grid"},
     "start-points": {"start": "points"},
+    "no-free-space": {"free_space": 0.0},
 }
 
 

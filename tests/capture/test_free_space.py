@@ -28,13 +28,14 @@ def test_it_reaches_a_share_of_the_way_to_the_box() -> None:
     assert space.contains(places).tolist() == [False, True, True, False, False]
 
 
-def test_points_in_view_bring_its_end_nearer() -> None:
+def test_points_before_a_camera_bring_its_end_nearer() -> None:
     far = torch.rand(300, 3) * 2.0 - 1.0
     assert reach_of(far) == 2.0
     near = torch.tensor([[0.0, 0.0, 3.0]]).repeat(20, 1)
     assert reach_of(torch.cat((far, near))) == pytest.approx(1.0)
-    # Few of them are mismatches; what the camera does not see says nothing about it.
+    # Few of them are mismatches; what lies outside of the cone says nothing about it.
     assert reach_of(torch.cat((far, near[:2]))) == 2.0
+    assert reach_of(torch.cat((far, near + torch.tensor([1.8, 0.0, 0.0])))) == pytest.approx(1.345, abs=1e-3)
     assert reach_of(torch.cat((far, near + torch.tensor([3.0, 0.0, 0.0])))) == 2.0
     assert reach_of(torch.cat((far, near + torch.tensor([0.0, 0.0, 3.0])))) == 2.0
 

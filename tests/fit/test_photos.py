@@ -86,7 +86,7 @@ def test_nothing_is_put_before_the_cameras(room: dtv.Capture, start: str) -> Non
     capture = dataclasses.replace(room, points=0.9 * points)
     options = FAST | {"cells": 4000, "iterations": 60, "start": start, "exchange": Exchange(rounds=6, until=0.5)}
     config = dtv.FitConfig(**options, harmonics=0)
-    assert config.for_capture(capture).free_space == 0.8
+    assert config.for_capture(capture).free_space == 0.8 and config.for_capture(room).free_space == 0.5
     assert config.for_capture(dataclasses.replace(capture, surroundings=1.0)).free_space == 0.0
     trainer = Trainer(capture, config)
     space = capture.free_space(0.8)
@@ -113,7 +113,7 @@ def test_free_space_lies_before_the_training_cameras(room: dtv.Capture) -> None:
 def test_free_space_empties_an_initial_field(room: dtv.Capture) -> None:
     mesh = dtv.TetMesh.grid((6, 6, 6), (-5, -5, -5), (5, 5, 5))
     trainer = Trainer(room, dtv.FitConfig(**FAST, harmonics=0), mesh)
-    is_free = room.free_space(0.8).contains(mesh.vertices)
+    is_free = room.free_space(0.5).contains(mesh.vertices)
     assert is_free.any() and ((trainer.parameters.density == 0.0) == is_free).all()
 
 

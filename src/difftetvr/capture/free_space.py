@@ -11,7 +11,7 @@ import torch
 from difftetvr.capture.viewing import Floats, in_image, positions_of, project
 from difftetvr.render.camera import Camera
 
-_NEAREST = 1.0  # percent of the points of an image: fewer that are nearer are matched wrongly
+_NEAREST = 1.0  # percent of the points in a cone: fewer that are nearer are matched wrongly
 _BESIDE = 0.5  # of the image's longer side, to all sides: other views look through what is next to a view
 
 
@@ -33,12 +33,12 @@ class FreeSpace:
 
     @staticmethod
     def of(cameras: Sequence[Camera], bounds: torch.Tensor, points: torch.Tensor | None, share: float) -> FreeSpace:
-        """A share of the way to what is nearest, be it the scene's box or the points that a camera sees.
+        """A share of the way to what is nearest, be it the scene's box or the points in the cone.
 
         Args:
             cameras: N cameras; nothing is free before those within the bounds.
             bounds: (2, 3) corners of the scene's box.
-            points: (P, 3) points on surfaces, or None. Each image does without the nearest hundredth of its points.
+            points: (P, 3) points on surfaces, or None. The nearest hundredth of those in a cone does not count.
             share: Share of the way, in [0, 1).
         """
         places = None if points is None else points.double().numpy()
@@ -51,7 +51,7 @@ class FreeSpace:
         found = torch.zeros(len(places), dtype=torch.bool, device=places.device)
         for camera, reach in zip(self.cameras, self.reaches, strict=True):
             local = camera.to_camera_space(places)
-            depth, margin = local[:, 2], _BESIDE * max(camera.width, camera.height)
+            depth, margin = local[:, 2], _margin(camera)
             # Pixels times depth, which are finite also beside the camera.
             x, y = (camera.fx * local[:, 0] + camera.cx * depth, camera.fy * local[:, 1] + camera.cy * depth)
             within = (x > -margin * depth) & (x < (camera.width + margin) * depth)
@@ -61,11 +61,16 @@ class FreeSpace:
 
 
 def _nearest(camera: Camera, bounds: Floats, points: Floats | None) -> float:
-    """Distance of a camera from what it sees of the scene at least, 0 within the bounds."""
+    """Distance of a camera from the scene or what is known to be before it, 0 within the bounds."""
     position = positions_of([camera])[0]
     distance = float(np.linalg.norm(position - position.clip(*bounds)))
     if points is not None:
-        seen = points[in_image(*project(points, camera), camera)]
-        if len(seen):
-            distance = min(distance, float(np.percentile(np.linalg.norm(seen - position, axis=1), _NEAREST)))
+        before = points[in_image(*project(points, camera), camera, _margin(camera))]
+        if len(before):
+            distance = min(distance, float(np.percentile(np.linalg.norm(before - position, axis=1), _NEAREST)))
     return distance
+
+
+def _margin(camera: Camera) -> float:
+    """Pixels by which a cone is wider than the view, to all sides."""
+    return _BESIDE * max(camera.width, camera.height)

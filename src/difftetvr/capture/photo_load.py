@@ -110,17 +110,11 @@ def present_views(photo_set: PhotoSet, downscale: int) -> list[View]:
     advice = f"give a downscale that '{copies[0].name}' fits" if copies else "get the capture anew"
     if not photo_set.may_miss:
         raise CaptureError(f"The image {first.label} is missing; {advice}.")
+    verb = "is" if len(absent) == 1 else "are"
+    found = f"{len(absent)} of the {len(views)} images of '{photo_set.name}' {verb} missing, such as {first.label}"
     if 2 * len(absent) > len(views):
-        raise CaptureError(
-            f"{len(absent)} of the {len(views)} images of '{photo_set.name}' are missing, such as {first.label}; "
-            f"{advice}."
-        )
-    warnings.warn(
-        f"{len(absent)} of the {len(views)} images of '{photo_set.name}' are missing, such as {first.label}; "
-        "they are left out.",
-        CaptureWarning,
-        stacklevel=2,
-    )
+        raise CaptureError(f"{found}; {advice}.")
+    warnings.warn(f"{found}; left out.", CaptureWarning, stacklevel=2)
     return [view for view in views if view not in absent]
 
 

@@ -39,7 +39,7 @@ _STARTS = ("grid", "hull", "points")
 _DEFAULT_CELLS, _DEFAULT_ITERATIONS = 20_000, 2400
 _PHOTO_BANDS, _PHOTO_ITERATIONS = 2, 4800
 _PHOTO_PIXELS_PER_CELL = 12
-_PHOTO_FREE_SPACE = 0.8
+_FREE_BEFORE_POINTS, _FREE_BEFORE_BOUNDS = 0.8, 0.5
 _MOST_PHOTO_CELLS = 1_000_000
 _BAND_SHARE = 0.05  # of the run, from one band of harmonics to the next
 _STRATEGIES = ("exchange", "grow", "star", "none")
@@ -134,7 +134,8 @@ class FitConfig:
     """Pull towards zero density, in mean absolute density gradients; removes fog that no training view can refute."""
     free_space: float | None = None
     """Share of the way from each training camera to the scene that is kept empty, in a cone wider than its view: to the
-    capture's bounds, or to sparse points that are nearer. Default: 0.8 for photographs with a background, else 0."""
+    capture's bounds, or to sparse points that are nearer. Default: for photographs with a background 0.8 where there
+    are sparse points, else 0.5; for all else 0."""
     sparsity: float = 0.0
     """Weight of a loss that favours few opaque places over much fog: the mean over vertices of log(1 + 2 density^2)."""
     initial_color: float = 0.5
@@ -221,13 +222,15 @@ class FitConfig:
     def _choices_for_photos(self, capture: Capture) -> dict[str, Any]:
         pixels = len(capture.train_indices) * math.prod(capture.images.shape[1:3])
         without_silhouettes = "grid" if capture.scene_points is None or self.grid is not None else "points"
+        # Bounds alone do not say what else may stand before them.
+        free_space = _FREE_BEFORE_BOUNDS if capture.scene_points is None else _FREE_BEFORE_POINTS
         return {
             "cells": max(_DEFAULT_CELLS, min(pixels // _PHOTO_PIXELS_PER_CELL, _MOST_PHOTO_CELLS)),
             "start": without_silhouettes if capture.silhouettes is None else "hull",
             "iterations": _PHOTO_ITERATIONS,
             "background": "random" if capture.is_cut_out else "black",
             "harmonics": _PHOTO_BANDS,
-            "free_space": _PHOTO_FREE_SPACE if capture.surroundings > 1.0 else 0.0,
+            "free_space": free_space if capture.surroundings > 1.0 else 0.0,
         }
 
     def bands_at(self, iteration: int) -> int:
