@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from difftetvr.capture.free_space import FreeSpace
 from difftetvr.capture.viewing import pose_of, positions_of
+from difftetvr.errors import CaptureError
 from difftetvr.render import Camera
 
 BOX = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
@@ -40,11 +41,33 @@ def test_points_before_a_camera_bring_its_end_nearer() -> None:
     assert reach_of(torch.cat((far, near + torch.tensor([0.0, 0.0, 3.0])))) == 2.0
 
 
+def test_few_points_count_all() -> None:
+    far = torch.tensor([[0.0, 0.0, 0.5]]).repeat(49, 1)
+    assert reach_of(torch.cat((far, torch.tensor([[0.0, 0.0, 4.0]])))) == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("share", [-0.1, 1.0, 5.0, float("nan")])
+def test_shares_out_of_range_are_refused(share: float) -> None:
+    with pytest.raises(CaptureError, match=r"share of free space .* below 1"):
+        FreeSpace.of([ASIDE], BOX, None, share)
+
+
 def test_nothing_is_free_before_cameras_in_the_scene_or_where_none_is_asked_for() -> None:
     inside = ASIDE.with_pose(torch.eye(4))
     assert FreeSpace.of([inside, ASIDE], BOX, None, 0.5).cameras == [ASIDE]
+    away = Camera.look_at((0.0, 0.0, 5.0), (0.0, 0.0, 9.0), (0.0, 1.0, 0.0), fov_y=0.8, width=60, height=40)
+    assert FreeSpace.of([away, ASIDE], BOX, None, 0.5).cameras == [ASIDE]
     nowhere = FreeSpace.of([ASIDE], BOX, None, 0.0)
     assert not nowhere.contains(torch.randn(1000, 3) * 4.0).any()
+
+
+def looks_at_box(pose: np.ndarray) -> bool:
+    """Whether a camera of 30 x 50 pixels with a field of view of 0.7 has something of the box in its cone."""
+    axis = (np.arange(16) + 0.5) / 8 - 1.0
+    grid = np.stack(np.meshgrid(axis, axis, axis), -1).reshape(-1, 3) @ pose[:3, :3].T + pose[:3, 3]
+    focal = 25 / np.tan(0.35)
+    within = (np.abs(grid[:, 0]) * focal <= 40 * grid[:, 2]) & (np.abs(grid[:, 1]) * focal <= 50 * grid[:, 2])
+    return bool((within & (grid[:, 2] > 0)).any())
 
 
 @given(st.integers(0, 10_000), st.floats(0.05, 0.95))
@@ -58,7 +81,7 @@ def test_it_is_the_union_of_the_cones_that_are_wider_than_the_views(seed: int, s
     for camera, eye in zip(cameras, positions_of(cameras), strict=True):
         pose = pose_of(camera)
         local = places @ pose[:3, :3].T + pose[:3, 3]
-        way = np.linalg.norm(np.maximum(np.abs(eye) - 1.0, 0.0))
+        way = np.linalg.norm(np.maximum(np.abs(eye) - 1.0, 0.0)) if looks_at_box(pose) else 0.0
         # Half the longer side more on either side of 30 x 50 pixels.
         across = np.abs(local[:, 0]) * camera.fx < 40 * local[:, 2]
         along = np.abs(local[:, 1]) * camera.fy < 50 * local[:, 2]

@@ -171,12 +171,14 @@ def test_bisecting_where_units_differ_changes_nothing(room: dtv.Capture) -> None
     parameters = FieldParameters(mesh, config, room.density_units_at(mesh.vertices))
     with torch.no_grad():
         parameters.density.copy_(torch.rand(mesh.num_vertices, generator=torch.Generator().manual_seed(1)))
+    parameters.keep_free(mesh.vertices[:, 0] > 0.5)
     before = parameters.detached_field()
     count = mesh.topology.edges.shape[0]
     chosen = independent_edges(mesh, torch.arange(count).float(), torch.ones(count, dtype=torch.bool), 500)
     change: MeshChange = bisect_edges(mesh, chosen)
     parameters.carry(change)
     torch.testing.assert_close(parameters.detached_field().density, change.carry(before.density))
+    assert torch.equal(parameters.is_free, ~change.is_new & (change.mesh.vertices[:, 0] > 0.5))
     camera = room.cameras[3]
     with torch.no_grad():
         images = [dtv.render(mesh, before, camera), dtv.render(change.mesh, parameters.detached_field(), camera)]

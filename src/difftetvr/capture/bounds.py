@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from difftetvr.capture.hull import VisualHull
-from difftetvr.capture.viewing import Floats, in_image, pose_of, positions_of, project
+from difftetvr.capture.viewing import Floats, cell_centers, in_image, pose_of, positions_of, project
 from difftetvr.errors import CaptureError
 from difftetvr.render.camera import Camera
 
@@ -46,7 +46,7 @@ def hull_bounds(cameras: Sequence[Camera], masks: torch.Tensor | None) -> Floats
     box = _box_of_cameras(cameras)
     count = _COARSE_GRID if masks is not None else _FINE_GRID
     cell = (box[1, 0] - box[0, 0]) / count
-    centers = _cell_centers(box, count)
+    centers = cell_centers(box, count)
     while True:
         centers = centers[hull.keeps(centers, cell, _LEAST_SHARE_OF_VIEWS)]
         if not len(centers):
@@ -118,7 +118,7 @@ def require_seen(bounds: Floats, cameras: Sequence[Camera], name: str, most_blin
     Raises:
         CaptureError: More than a share ``most_blind`` of them see nothing of it.
     """
-    points = _cell_centers(bounds, _COARSE_GRID)
+    points = cell_centers(bounds, _COARSE_GRID)
     blind = [camera for camera in cameras if not in_image(*project(points, camera), camera).any()]
     if len(blind) > most_blind * len(cameras):
         lower, upper = (np.array2string(corner, precision=3) for corner in bounds)
@@ -145,10 +145,3 @@ def _box_of_cameras(cameras: Sequence[Camera]) -> Floats:
     focus = np.linalg.solve(total, (across @ positions[:, :, None]).sum(axis=0)[:, 0])
     reach = np.linalg.norm(positions - focus, axis=1).max()
     return np.stack([focus - reach, focus + reach])
-
-
-def _cell_centers(box: Floats, count: int) -> Floats:
-    """(count^3, 3) centres of the cells of a grid over a box."""
-    places = (np.arange(count) + 0.5) / count
-    axes = [box[0, axis] + places * (box[1, axis] - box[0, axis]) for axis in range(3)]
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)

@@ -186,6 +186,9 @@ class Capture:
 
         Args:
             share: Share of the way from a camera to the scene, in [0, 1).
+
+        Raises:
+            CaptureError: The share is out of range.
         """
         cameras = [self.cameras[view] for view in self.train_indices.tolist()]
         return FreeSpace.of(cameras, self.bounds, self.scene_points, share)

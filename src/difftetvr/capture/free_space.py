@@ -1,4 +1,4 @@
-"""Where nothing is: the space before the cameras, which they could not see through otherwise."""
+"""Space in front of the cameras that must be empty, because they see the scene through it."""
 
 from __future__ import annotations
 
@@ -8,10 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from difftetvr.capture.viewing import Floats, in_image, positions_of, project
+from difftetvr.capture.viewing import Floats, cell_centers, in_image, positions_of, project
+from difftetvr.errors import CaptureError
+from difftetvr.mesh.arrays import true_indices
 from difftetvr.render.camera import Camera
 
 _NEAREST = 1.0  # percent of the points in a cone: fewer that are nearer are matched wrongly
+_LOOKED_AT = 16  # cubes along each side of the box, to find out whether a camera looks at it
 _BESIDE = 0.5  # of the image's longer side, to all sides: other views look through what is next to a view
 
 
@@ -36,11 +39,16 @@ class FreeSpace:
         """A share of the way to what is nearest, be it the scene's box or the points in the cone.
 
         Args:
-            cameras: N cameras; nothing is free before those within the bounds.
+            cameras: N cameras; nothing is free before those within the bounds, or whose cone misses them.
             bounds: (2, 3) corners of the scene's box.
             points: (P, 3) points on surfaces, or None. The nearest hundredth of those in a cone does not count.
             share: Share of the way, in [0, 1).
+
+        Raises:
+            CaptureError: The share is out of range.
         """
+        if not 0.0 <= share < 1.0:
+            raise CaptureError(f"The share of free space is {share}; it must be at least 0 and below 1.")
         places = None if points is None else points.double().numpy()
         nearest = [_nearest(camera, bounds.double().numpy(), places) for camera in cameras] if share else []
         free = [(camera, share * distance) for camera, distance in zip(cameras, nearest) if distance > 0.0]
@@ -50,24 +58,31 @@ class FreeSpace:
         """(N,) bool, which of (N, 3) places are empty."""
         found = torch.zeros(len(places), dtype=torch.bool, device=places.device)
         for camera, reach in zip(self.cameras, self.reaches, strict=True):
-            local = camera.to_camera_space(places)
+            # Most places are far from most cameras.
+            away = torch.linalg.vector_norm(places - camera.position.to(places), dim=1)
+            near = true_indices((away < reach) & ~found)
+            local = camera.to_camera_space(places[near])
             depth, margin = local[:, 2], _margin(camera)
             # Pixels times depth, which are finite also beside the camera.
             x, y = (camera.fx * local[:, 0] + camera.cx * depth, camera.fy * local[:, 1] + camera.cy * depth)
             within = (x > -margin * depth) & (x < (camera.width + margin) * depth)
             within &= (y > -margin * depth) & (y < (camera.height + margin) * depth)
-            found |= within & (depth > 0.0) & (torch.linalg.vector_norm(local, dim=1) < reach)
+            found[near] = within & (depth > 0.0)
         return found
 
 
 def _nearest(camera: Camera, bounds: Floats, points: Floats | None) -> float:
-    """Distance of a camera from the scene or what is known to be before it, 0 within the bounds."""
+    """Distance from the scene's box, or the nearest points in the cone; 0 for cameras within the box or looking off."""
     position = positions_of([camera])[0]
+    if not in_image(*project(cell_centers(bounds, _LOOKED_AT), camera), camera, _margin(camera)).any():
+        return 0.0
     distance = float(np.linalg.norm(position - position.clip(*bounds)))
     if points is not None:
         before = points[in_image(*project(points, camera), camera, _margin(camera))]
         if len(before):
-            distance = min(distance, float(np.percentile(np.linalg.norm(before - position, axis=1), _NEAREST)))
+            # An interpolated one would pass over near points where there are few.
+            nearest = np.percentile(np.linalg.norm(before - position, axis=1), _NEAREST, method="lower")
+            distance = min(distance, float(nearest))
     return distance
 
 

@@ -37,3 +37,10 @@ def in_image(pixels: Floats, depth: Floats, camera: Camera, reach: Floats | floa
     x, y = pixels.T
     across = (x >= -reach) & (x < camera.width + reach)
     return (depth > 0) & across & (y >= -reach) & (y < camera.height + reach)
+
+
+def cell_centers(box: Floats, count: int) -> Floats:
+    """(count^3, 3) centres of the cells of a grid over a box."""
+    places = (np.arange(count) + 0.5) / count
+    axes = [box[0, axis] + places * (box[1, axis] - box[0, axis]) for axis in range(3)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)

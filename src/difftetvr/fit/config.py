@@ -99,8 +99,8 @@ class FitConfig:
     """Cubes of the grid along x, y and z, 6 tetrahedra each, without those of a shell; overrides --cells, unless the
     mesh is to grow."""
     initial_mesh: str | None = None
-    """Mesh file to begin with instead of a grid; its colours and densities, if it has any, are the initial ones. It is
-    its own budget; only where it is to grow does --cells say how far."""
+    """Mesh file to begin with instead of a grid; its colours and densities, if it has any, are the initial ones (but
+    for free space). It is its own budget; only where it is to grow does --cells say how far."""
     repair: bool = False
     """Mend an initial mesh that has flat cells or repeated vertices or cells; without it such a mesh is refused."""
     move: bool = True

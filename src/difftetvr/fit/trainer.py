@@ -80,12 +80,12 @@ class Trainer:
         self.repair = start.repair
         self.starts_from_field = start.field is not None
         self._mesh = start.mesh.to(device=device_for(config, strategy))
+        self.positions = VertexOptimizer(self._mesh, config.motion) if config.move else None
         self.budget = self._budget(mesh is not None or config.grid is not None or config.initial_mesh is not None)
         units = capture.density_units_at(self._sites())
         self.parameters = FieldParameters(self._mesh, config, units, start.field)
         self._free_space = capture.free_space(config.free_space or 0.0)
         self.parameters.keep_free(self._free_space.contains(self._sites()))
-        self.positions = VertexOptimizer(self._mesh, config.motion) if config.move else None
         self.iteration = 0
         self.history = History()
         self._train_views: list[int] = capture.train_indices.tolist()
@@ -207,8 +207,8 @@ class Trainer:
 
     def _sites(self) -> torch.Tensor:
         """(N, 3) positions of the vertices, or centres of the cells, that the parameters belong to."""
-        vertices = self._mesh.vertices.detach()
-        return vertices if self.config.location == "vertex" else vertices[self._mesh.tets.long()].mean(1)
+        mesh = self.mesh
+        return mesh.vertices if self.config.location == "vertex" else mesh.vertices[mesh.tets.long()].mean(1)
 
     def _moment(self) -> Moment:
         return Moment(self.iteration, self.config.steps, self._epoch, self.mesh.num_cells, self.budget)
