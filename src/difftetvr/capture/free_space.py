@@ -49,8 +49,9 @@ class FreeSpace:
         """
         if not 0.0 <= share < 1.0:
             raise CaptureError(f"The share of free space is {share}; it must be at least 0 and below 1.")
-        places = None if points is None else points.double().numpy()
-        nearest = [_nearest(camera, bounds.double().numpy(), places) for camera in cameras] if share else []
+        box, places = bounds.double().numpy(), None if points is None else points.double().numpy()
+        looked_at = cell_centers(box, _LOOKED_AT)
+        nearest = [_nearest(camera, box, looked_at, places) for camera in cameras] if share else []
         free = [(camera, share * distance) for camera, distance in zip(cameras, nearest) if distance > 0.0]
         return FreeSpace([camera for camera, _ in free], [reach for _, reach in free])
 
@@ -71,12 +72,12 @@ class FreeSpace:
         return found
 
 
-def _nearest(camera: Camera, bounds: Floats, points: Floats | None) -> float:
+def _nearest(camera: Camera, box: Floats, looked_at: Floats, points: Floats | None) -> float:
     """Distance from the scene's box, or the nearest points in the cone; 0 for cameras within the box or looking off."""
     position = positions_of([camera])[0]
-    if not in_image(*project(cell_centers(bounds, _LOOKED_AT), camera), camera, _margin(camera)).any():
+    if not in_image(*project(looked_at, camera), camera, _margin(camera)).any():
         return 0.0
-    distance = float(np.linalg.norm(position - position.clip(*bounds)))
+    distance = float(np.linalg.norm(position - position.clip(*box)))
     if points is not None:
         before = points[in_image(*project(points, camera), camera, _margin(camera))]
         if len(before):
