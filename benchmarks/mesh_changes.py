@@ -25,7 +25,7 @@ from difftetvr.mesh import (
     remove_cells,
     star_subdivision,
 )
-from difftetvr.mesh.incidence import cell_edges
+from difftetvr.mesh.topology.incidence import cell_edges
 
 REPETITIONS = 3
 EXCHANGED = 0.08

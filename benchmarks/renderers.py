@@ -61,7 +61,7 @@ def measure(cubes: int, pixels: int, renderer: str, repetitions: int) -> dict[st
     from vtk_compare import smooth_field
 
     from difftetvr.mesh import Field, TetMesh
-    from difftetvr.render import Camera, OrderWarning, render
+    from difftetvr.rendering import Camera, OrderWarning, render
 
     warnings.simplefilter("error", OrderWarning)
     camera = Camera.look_at((1.05, 0.62, 0.48), (0.0, 0.0, 0.0), width=pixels, height=pixels)
@@ -108,8 +108,8 @@ def row(cubes: int, pixels: int, renderer: str, repetitions: int) -> dict[str, f
 def depth_complexity(cubes: int, pixels: int) -> float:
     """Mean number of cells of the rays that meet any."""
     from difftetvr.mesh import TetMesh
-    from difftetvr.render import Camera
-    from difftetvr.render.inspection import inspect_rays
+    from difftetvr.rendering import Camera
+    from difftetvr.rendering.inspection import inspect_rays
 
     camera = Camera.look_at((1.05, 0.62, 0.48), (0.0, 0.0, 0.0), width=pixels, height=pixels)
     counts = inspect_rays(TetMesh.grid((cubes,) * 3, (-0.5,) * 3, (0.5,) * 3), camera).depth_complexity

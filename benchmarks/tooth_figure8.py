@@ -19,9 +19,9 @@ from rich.table import Table
 from tooth_runs import KUHN_CELLS, Run, captures, changed, results_of, version
 
 import difftetvr as dtv
-from difftetvr.fit import softplus_regularizer
-from difftetvr.fit.evaluation import evaluate
-from difftetvr.fit.parameters import FieldParameters
+from difftetvr.fitting import softplus_regularizer
+from difftetvr.fitting.parameters import FieldParameters
+from difftetvr.fitting.records.evaluation import evaluate
 from difftetvr.mesh.motion import guard_move
 
 PICTURE = Path("docs/images/tooth_figure8.png")

@@ -17,9 +17,9 @@ import torch
 
 import difftetvr as dtv
 from difftetvr.capture import Capture
-from difftetvr.fit.config import Motion
-from difftetvr.fit.evaluation import evaluate
-from difftetvr.fit.refinement import Exchange, Grow, Star
+from difftetvr.fitting.motion import Motion
+from difftetvr.fitting.records.evaluation import evaluate
+from difftetvr.fitting.refinement import Exchange, Grow, Star
 
 STUDY = Path("out/study")
 VALIDATION_VIEWS = 16

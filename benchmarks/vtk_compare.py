@@ -27,8 +27,8 @@ from rich.console import Console
 from rich.table import Table
 
 from difftetvr.mesh import Field, TetMesh
-from difftetvr.render import render
-from difftetvr.render.camera import Camera
+from difftetvr.rendering import render
+from difftetvr.rendering.cameras.pinhole import Camera
 
 PIXELS = 512
 # The planes whose arrangement a Kuhn grid is, in units of its cubes.

@@ -19,8 +19,8 @@ from scipy.ndimage import map_coordinates
 from vtk.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray, vtk_to_numpy
 
 from difftetvr.mesh import Field, TetMesh
-from difftetvr.render import ScalarField
-from difftetvr.render.camera import Camera
+from difftetvr.rendering import ScalarField
+from difftetvr.rendering.cameras.pinhole import Camera
 
 _PROBE = "import vtk; w = vtk.vtkRenderWindow(); w.SetOffScreenRendering(1); w.SetSize(8, 8); w.Render()"
 

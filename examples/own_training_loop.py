@@ -3,7 +3,7 @@
 import torch
 
 import difftetvr as dtv
-from difftetvr.fit import VertexOptimizer, VertexOptimizerConfig
+from difftetvr.fitting import VertexOptimizer, VertexOptimizerConfig
 
 STEPS = 160
 

@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "src" / "difftetvr"
 SOURCES = sorted(PACKAGE.rglob("*.py"))
 
-GROUND = {"errors", "files", "libllvm"}
+GROUND = {"_version", "errors", "files", "libllvm"}
 """Modules that import nothing of this package but each other."""
 
 ALLOWED = {
@@ -22,17 +22,17 @@ ALLOWED = {
     "terminal": GROUND,
     "mesh": GROUND,
     "optics": GROUND | {"backend"},
-    "render": GROUND | {"backend", "mesh", "optics"},
-    "capture": GROUND | {"backend", "mesh", "optics", "render"},
-    "fit": GROUND | {"backend", "mesh", "optics", "render", "capture"},
-    "view": GROUND | {"backend", "mesh", "optics", "render", "capture", "fit"},
+    "rendering": GROUND | {"backend", "mesh", "optics"},
+    "capture": GROUND | {"backend", "mesh", "optics", "rendering"},
+    "fitting": GROUND | {"backend", "mesh", "optics", "rendering", "capture"},
+    "view": GROUND | {"backend", "mesh", "optics", "rendering", "capture", "fitting"},
 }
 """Parts, each with the parts it may import besides itself. `cli` and the package's surface may import all.
 
-`view` and `fit` are one storey; of the two, the one that shows results may know what a result is, never the reverse.
+`view` and `fitting` are one storey; of the two, the one that shows results may know what a result is, never the other.
 """
 
-MAY_TOUCH_DRJIT = {"backend", "optics", "render", "capture"}
+MAY_TOUCH_DRJIT = {"backend", "optics", "rendering", "capture"}
 """Parts that hold kernels, or torch functions around them."""
 
 
@@ -45,11 +45,15 @@ def module_of(file: Path) -> list[str]:
     return parts[:-1] if parts[-1] == "__init__" else parts
 
 
-def imported_modules(file: Path, module: list[str]) -> set[str]:
-    """Full names of everything a file imports, anywhere in it, lazy imports and relative ones included."""
+def imported_modules(file: Path, module: list[str], top_level_only: bool = False) -> set[str]:
+    """Full names of everything a file imports: relative imports included, and lazy ones unless told otherwise."""
     package = module if file.name == "__init__.py" else module[:-1]
     names = set()
-    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+    tree = ast.parse(file.read_text(encoding="utf-8"))
+    inside = {n for f in ast.walk(tree) if isinstance(f, ast.FunctionDef) for n in ast.walk(f)}
+    for node in ast.walk(tree):
+        if top_level_only and node in inside:
+            continue
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -79,16 +83,50 @@ def test_imports_run_downwards_only():
 def test_the_layering_test_sees_every_kind_of_import(tmp_path):
     file = tmp_path / "module.py"
     file.write_text(
-        "import difftetvr.fit.losses as x\nfrom difftetvr import render\nfrom ..mesh import TetMesh\n"
+        "import difftetvr.fitting.losses as x\nfrom difftetvr import rendering\nfrom ..mesh import TetMesh\n"
         "def f():\n    from difftetvr.capture.orbit import g\n    from . import kernels\n"
     )
     assert imported_modules(file, ["difftetvr", "optics", "module"]) == {
-        "difftetvr.fit.losses",
-        "difftetvr.render",
+        "difftetvr.fitting.losses",
+        "difftetvr.rendering",
         "difftetvr.mesh.TetMesh",
         "difftetvr.capture.orbit.g",
         "difftetvr.optics.kernels",
     }
+
+
+def names_by_module() -> dict[str, set[str]]:
+    """Modules of the package, each with those it imports while it is itself imported, or for its types."""
+    files = {".".join(module_of(file)): file for file in SOURCES}
+    home = {}  # of names that a package hands on lazily, as its stub says
+    for stub in PACKAGE.rglob("__init__.pyi"):
+        package = module_of(stub.with_suffix(".py"))
+        for name in imported_modules(stub, [*package, "__init__"]):
+            home[".".join([*package, name.rpartition(".")[2]])] = name
+    return {
+        name: {
+            module
+            for imported in imported_modules(file, module_of(file), top_level_only=True)
+            for module in (imported, home.get(imported, imported).rpartition(".")[0])
+            if module in files and module != name
+        }
+        for name, file in files.items()
+    }
+
+
+def test_no_modules_import_each_other_in_a_circle():
+    left = names_by_module()
+    while free := {name for name, imported in left.items() if not imported & left.keys()}:
+        left = {name: imported for name, imported in left.items() if name not in free}
+    assert not left, f"a circle runs through some of {sorted(left)}"
+
+
+def test_rooms_are_small_and_say_what_they_answer():
+    for room in {file.parent for file in SOURCES} - {PACKAGE}:
+        files = list(room.glob("*.py"))
+        assert (room / "__init__.py") in files, f"{room} has no __init__.py"
+        assert len(files) <= 13, f"{room} holds {len(files) - 1} files besides its __init__; make an inner room"
+        assert ast.get_docstring(ast.parse((room / "__init__.py").read_text())), f"{room} does not say what it answers"
 
 
 def test_only_kernels_and_their_wrappers_touch_drjit():
@@ -108,15 +146,14 @@ def test_files_stay_short():
 
 
 def written_version() -> str:
-    project = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
-    return re.search(r'^version = "(.+)"$', project, re.MULTILINE)[1]
+    return re.search(r'^__version__ = "(.+)"$', (PACKAGE / "_version.py").read_text(encoding="utf-8"), re.MULTILINE)[1]
 
 
 def test_versions_agree():
     import difftetvr
 
     version = written_version()
-    assert getattr(difftetvr, "__version__", version) == version
+    assert difftetvr.__version__ == version
     try:
         assert metadata.version("difftetvr") == version
     except metadata.PackageNotFoundError:

@@ -2,39 +2,15 @@
 
 From a mesh with colour and density and a camera to an image, and from the derivative of a loss on that image back to
 colours, densities, transfer functions, vertex positions and camera poses; from images to a tetrahedral volume.
+
+    import difftetvr as dtv
+    image = dtv.render(mesh, dtv.Field(color, density), camera)
+    result = dtv.fit(dtv.load_capture("photos"), dtv.FitConfig(cells=100_000))
+
+Names load when they are first used, so that importing the package, and asking the command line for help, costs no
+import of PyTorch; ``EAGER_IMPORT=1`` in the environment loads all at once.
 """
 
-from difftetvr.capture import Capture, TransferFunction, Volume, VolumeCapture, load_capture
-from difftetvr.errors import BackendError, CameraError, CaptureError, DiffTetError, MeshError
-from difftetvr.fit import FitConfig, FitError, FitResult, fit
-from difftetvr.mesh import Field, TetMesh
-from difftetvr.mesh.io import MeshData, load, load_data, load_mesh, save
-from difftetvr.render import Camera, RenderedImage, ScalarField, render
+import lazy_loader
 
-__all__ = [
-    "BackendError",
-    "Camera",
-    "CameraError",
-    "Capture",
-    "CaptureError",
-    "DiffTetError",
-    "Field",
-    "FitConfig",
-    "FitError",
-    "FitResult",
-    "MeshData",
-    "MeshError",
-    "RenderedImage",
-    "ScalarField",
-    "TetMesh",
-    "TransferFunction",
-    "Volume",
-    "VolumeCapture",
-    "fit",
-    "load",
-    "load_capture",
-    "load_data",
-    "load_mesh",
-    "render",
-    "save",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -19,6 +19,10 @@ class CameraError(DiffTetError):
     """A camera's pose, intrinsics or image size is invalid."""
 
 
+class FitError(DiffTetError):
+    """The options, the checkpoint or the output folder of a reconstruction is invalid."""
+
+
 class BackendError(DiffTetError):
     """No Dr.Jit back end can run the kernels on this machine or on the device of the given tensors."""
 

@@ -8,7 +8,6 @@ import io
 import re
 import sys
 
-import torch
 from rich.console import Console
 from rich.status import Status
 from rich.text import Text
@@ -63,7 +62,8 @@ def sentence_for(error: Exception) -> str | None:
 
 def is_out_of_memory(error: BaseException) -> bool:
     """Whether an error of Python, NumPy, PyTorch or Dr.Jit means that memory is short."""
-    if isinstance(error, MemoryError | torch.OutOfMemoryError):
+    torch = sys.modules.get("torch")  # only what has been imported can have raised
+    if isinstance(error, MemoryError) or (torch is not None and isinstance(error, torch.OutOfMemoryError)):
         return True
     if isinstance(error, OSError):
         return error.errno == errno.ENOMEM

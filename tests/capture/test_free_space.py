@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from difftetvr.capture.free_space import FreeSpace
 from difftetvr.capture.viewing import pose_of, positions_of
 from difftetvr.errors import CaptureError
-from difftetvr.render import Camera
+from difftetvr.rendering import Camera
 
 BOX = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
 ASIDE = Camera.look_at((0.0, 0.0, 5.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), fov_y=0.8, width=60, height=40)

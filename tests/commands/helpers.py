@@ -5,8 +5,8 @@ import re
 
 import difftetvr.cli as cli
 
-LOOP = importlib.import_module("difftetvr.fit.loop")  # difftetvr.fit is the function, too
-TRAINER = importlib.import_module("difftetvr.fit.trainer")
+LOOP = importlib.import_module("difftetvr.fitting.loop")
+TRAINER = importlib.import_module("difftetvr.fitting.trainer")
 VIEWS = ["--views", "10", "--width", "24", "--height", "24"]
 FIT = ["--cells", "500", "--iterations", "4", "--device", "cpu"]
 

@@ -11,9 +11,9 @@ import torch
 from commands.helpers import FIT, TRAINER, VIEWS, fails, raising
 
 import difftetvr.cli as cli
-from difftetvr.fit.checkpoint import Checkpoint
-from difftetvr.fit.folder import RunFolder
-from difftetvr.fit.trainer import Trainer
+from difftetvr.fitting.records.checkpoint import Checkpoint
+from difftetvr.fitting.records.folder import RunFolder
+from difftetvr.fitting.trainer import Trainer
 from difftetvr.terminal import sentence_for
 
 

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from capture.photo_scene import write_colmap, write_nerf_synthetic
+from capture.photos.photo_scene import write_colmap, write_nerf_synthetic
 from commands.helpers import fails
 from PIL import Image
 

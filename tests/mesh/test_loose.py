@@ -5,7 +5,7 @@ import torch
 
 from difftetvr.errors import MeshError
 from difftetvr.mesh import TetMesh, Topology, bisect_edges, remove_cells, star_subdivision
-from difftetvr.mesh.incidence import boundary_vertices, cell_edges, cell_faces
+from difftetvr.mesh.topology.incidence import boundary_vertices, cell_edges, cell_faces
 
 LOOSE = "This mesh is made of loose cells"
 

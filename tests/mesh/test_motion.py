@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from difftetvr import TetMesh
 from difftetvr.errors import MeshError
 from difftetvr.mesh.boundary import BoundaryConstraint
-from difftetvr.mesh.motion import MotionLimits, cap_move, guard_move
+from difftetvr.mesh.limits import MotionLimits
+from difftetvr.mesh.motion import cap_move, guard_move
 from difftetvr.mesh.quality import quality, volumes
 from difftetvr.mesh.shapes import measure_vertices
 

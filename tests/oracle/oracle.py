@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from difftetvr.render.camera import Camera
+from difftetvr.rendering.cameras.pinhole import Camera
 
 NODES_PER_PANEL = 14
 # With 14 nodes the error of a panel over which the optical depth grows by 8 is below 1e-16.

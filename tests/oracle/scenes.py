@@ -17,7 +17,7 @@ from oracle.oracle import OracleImage, render_oracle
 from scipy.spatial import Delaunay
 from torch import Tensor
 
-from difftetvr.render.camera import Camera
+from difftetvr.rendering.cameras.pinhole import Camera
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from oracle.scenes import (
 from scipy.special import dawsn, erfcx
 from torch import Tensor
 
-from difftetvr.render.camera import Camera
+from difftetvr.rendering.cameras.pinhole import Camera
 
 
 def camera_in_double(camera: Camera) -> Camera:

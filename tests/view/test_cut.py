@@ -9,7 +9,7 @@ from PIL import Image
 
 from difftetvr.capture import VolumeCapture
 from difftetvr.errors import CaptureError, MeshError
-from difftetvr.fit.history import History, RefinementRecord
+from difftetvr.fitting.records.history import History, RefinementRecord
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.view.compare import Model, compare_models
 from difftetvr.view.cut import Plane, cut_picture

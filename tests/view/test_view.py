@@ -7,10 +7,10 @@ from PIL import Image
 from rich.console import Console
 
 from difftetvr.errors import CaptureError
-from difftetvr.fit.evaluation import Evaluation
-from difftetvr.fit.history import History, MoveTotals, RefinementRecord
-from difftetvr.fit.progress import ProgressDisplay
-from difftetvr.fit.result import Progress
+from difftetvr.fitting.records.evaluation import Evaluation
+from difftetvr.fitting.records.history import History, MoveTotals, RefinementRecord
+from difftetvr.fitting.records.progress import ProgressDisplay
+from difftetvr.fitting.records.result import Progress
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.view.describe import evaluation_table, mesh_tables
 from difftetvr.view.pictures import comparison, save_comparisons, save_png

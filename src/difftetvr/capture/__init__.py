@@ -1,74 +1,9 @@
-"""Where images come from: volumes with transfer functions, photographs, saved captures, camera orbits."""
+"""Where do images come from, and which cameras took them?
 
-from __future__ import annotations
+A :class:`~difftetvr.Capture` holds both; inner rooms make it from photographs (`photos`) and from scanned volumes
+(`volumes`).
+"""
 
-from dataclasses import fields
-from pathlib import Path
-from typing import Any
+import lazy_loader
 
-from difftetvr.capture.capture import Capture
-from difftetvr.capture.orbit import fibonacci_orbit, random_orbit
-from difftetvr.capture.packed import PackedImages
-from difftetvr.capture.photo_set import CaptureWarning
-from difftetvr.capture.photos import PhotoCapture, is_photo_source
-from difftetvr.capture.volume import Volume, is_volume_file
-from difftetvr.capture.volume_capture import TOOTH, VolumeCapture
-from difftetvr.capture.volume_renderer import VolumeRenderer
-from difftetvr.errors import CaptureError
-from difftetvr.optics.transfer_function import TransferFunction
-
-__all__ = [
-    "Capture",
-    "CaptureWarning",
-    "PackedImages",
-    "PhotoCapture",
-    "TransferFunction",
-    "Volume",
-    "VolumeCapture",
-    "VolumeRenderer",
-    "fibonacci_orbit",
-    "is_photo_source",
-    "load_capture",
-    "random_orbit",
-]
-
-
-def load_capture(source: str | Path, **overrides: Any) -> Capture:
-    """Images and cameras from whatever ``source`` is.
-
-    Args:
-        source: ``tooth`` for the packaged scan, a volume file (``.raw``, ``.dat``, ``.nrrd``, ``.nhdr``, ``.vti``), a
-            capture saved as ``.npz``, or photographs with known cameras: a folder (NeRF-synthetic, nerfstudio,
-            instant-ngp, COLMAP, or with a cameras.json of our own), such a ``.json`` file, or a tiny NeRF ``.npz``.
-        **overrides: Fields of :class:`VolumeCapture` for the tooth and for volumes; a volume needs at least
-            ``transfer_function``. Fields of :class:`PhotoCapture` for photographs. None stands for the field's default.
-
-    Raises:
-        CaptureError: The source or an override is not known or not valid.
-    """
-    chosen = {key: value for key, value in overrides.items() if value is not None}
-    kind = _kind(source, chosen)
-    if kind is None:
-        if chosen:
-            raise CaptureError(f"The saved capture '{source}' is read as it is; leave out '{sorted(chosen)[0]}'.")
-        return Capture.load(source)
-    known = {field.name for field in fields(kind)} - {"path"}
-    unknown = sorted(set(chosen) - known)
-    if unknown:
-        what = "A capture of photos" if kind is PhotoCapture else "A capture of a volume"
-        raise CaptureError(f"{what} has no setting '{unknown[0]}'; known are {', '.join(sorted(known))}.")
-    return kind(path=str(source), **chosen).build()
-
-
-def _kind(source: str | Path, chosen: dict[str, Any]) -> type[VolumeCapture | PhotoCapture] | None:
-    """What describes a source; None for a saved capture, which describes itself."""
-    if str(source) == TOOTH or is_volume_file(source):
-        return VolumeCapture
-    if "format" in chosen or is_photo_source(source):
-        return PhotoCapture
-    if Path(source).suffix.lower() == ".npz":
-        return None
-    raise CaptureError(
-        f"'{source}' is no capture: give 'tooth', a volume (.raw, .dat, .nrrd, .nhdr, .vti), a saved capture (.npz), "
-        "or a folder of photos with their cameras."
-    )
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Literal, get_args
@@ -15,7 +15,7 @@ from difftetvr.capture.free_space import FreeSpace
 from difftetvr.capture.hull import silhouettes
 from difftetvr.capture.packed import PackedImages
 from difftetvr.errors import CaptureError
-from difftetvr.render.camera import Camera
+from difftetvr.rendering.cameras.pinhole import Camera
 
 Encoding = Literal["linear", "srgb"]
 
@@ -221,7 +221,7 @@ class Capture:
         Raises:
             CaptureError: The name does not end in ``.npz``, or the file cannot be written.
         """
-        write_capture(self, path)
+        write_capture(path, {field.name: getattr(self, field.name) for field in fields(self)})
 
     @staticmethod
     def load(path: str | Path) -> Capture:

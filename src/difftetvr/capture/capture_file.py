@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import zipfile
 import zlib
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,10 +14,7 @@ import torch
 from difftetvr.capture.packed import PackedImages
 from difftetvr.errors import CameraError, CaptureError
 from difftetvr.files import atomic_write
-from difftetvr.render.camera import Camera
-
-if TYPE_CHECKING:
-    from difftetvr.capture.capture import Capture
+from difftetvr.rendering.cameras.pinhole import Camera
 
 # Version 1 knew no encoding (all was linear), no bytes, no points and no masks, version 2 no surroundings.
 _VERSION = 3
@@ -34,29 +32,33 @@ _DAMAGE = (
 )
 
 
-def write_capture(capture: Capture, path: str | Path) -> None:
-    """Write a capture to one ``.npz`` file, which :func:`read_capture` reads back to the bit.
+def write_capture(path: str | Path, fields: Mapping[str, Any]) -> None:
+    """Write the fields of a capture to one ``.npz`` file, which :func:`read_capture` reads back to the bit.
+
+    Args:
+        path: File to write.
+        fields: All fields of a :class:`~difftetvr.Capture` by name.
 
     Raises:
         CaptureError: The name does not end in ``.npz``, or the file cannot be written.
     """
     if Path(path).suffix.lower() != ".npz":
         raise CaptureError(f"A capture is saved as .npz; '{path}' ends otherwise.")
-    cameras = capture.cameras
+    cameras = fields["cameras"]
     content: dict[str, Any] = {
         "version": np.array(_VERSION),
-        "images": _array(capture.images),
-        "test": capture.test.numpy(),
-        "bounds": capture.bounds.numpy(),
-        "name": np.array(capture.name),
-        "density_unit": np.array(capture.density_unit),
+        "images": _array(fields["images"]),
+        "test": fields["test"].numpy(),
+        "bounds": fields["bounds"].numpy(),
+        "name": np.array(fields["name"]),
+        "density_unit": np.array(fields["density_unit"]),
         "world_to_camera": torch.stack([c.world_to_camera.detach().cpu() for c in cameras]).numpy(),
         "intrinsics": np.array([(c.fx, c.fy, c.cx, c.cy) for c in cameras]),
-        "encoding": np.array(capture.encoding),
-        "surroundings": np.array(capture.surroundings),
+        "encoding": np.array(fields["encoding"]),
+        "surroundings": np.array(fields["surroundings"]),
     }
     for key in _OPTIONAL:
-        value = getattr(capture, key)
+        value = fields[key]
         if value is not None:
             content[key] = _array(value)
     with atomic_write(path, CaptureError) as temporary, temporary.open("wb") as file:

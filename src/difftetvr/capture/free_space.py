@@ -11,7 +11,7 @@ import torch
 from difftetvr.capture.viewing import Floats, cell_centers, in_image, positions_of, project
 from difftetvr.errors import CaptureError
 from difftetvr.mesh.arrays import true_indices
-from difftetvr.render.camera import Camera
+from difftetvr.rendering.cameras.pinhole import Camera
 
 _NEAREST = 1.0  # percent of the points in a cone: fewer that are nearer are matched wrongly
 _LOOKED_AT = 16  # cubes along each side of the box, to find out whether a camera looks at it

@@ -13,7 +13,7 @@ from scipy import ndimage
 
 from difftetvr.capture.packed import PackedImages
 from difftetvr.capture.viewing import in_image, project
-from difftetvr.render.camera import Camera
+from difftetvr.rendering.cameras.pinhole import Camera
 
 _SILHOUETTE_PIXELS = 200  # of the shorter side, after coarsening
 _LEAST_ALPHA = 0.02

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from difftetvr.errors import CaptureError
-from difftetvr.render.camera import Camera
+from difftetvr.rendering.cameras.pinhole import Camera
 
 # The field of view of the published experiments: the image plane at distance 1 has height 1.
 DEFAULT_FOV_Y = 2.0 * math.atan(0.5)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from difftetvr.render.camera import Camera
+from difftetvr.rendering.cameras.pinhole import Camera
 
 Floats = NDArray[np.float64]
 

@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from difftetvr.cli.options import CaptureOptions, MeshOptions, load_model
-from difftetvr.errors import MeshError, counted
+from difftetvr.errors import FitError, MeshError, counted
 from difftetvr.files import require_writable
-from difftetvr.fit.errors import FitError
-from difftetvr.fit.folder import write_json
+from difftetvr.fitting.records.folder import write_json
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -40,7 +39,7 @@ class Eval:
 
     def run(self, console: Console) -> None:
         """Renders the views and prints PSNR and SSIM of each."""
-        from difftetvr.fit.evaluation import evaluate, usual_background
+        from difftetvr.fitting.records.evaluation import evaluate, usual_background
         from difftetvr.view.describe import evaluation_table
 
         if self.output is not None:
@@ -122,9 +121,9 @@ class Export:
 
 
 def _is_capture(path: Path) -> bool:
-    from difftetvr.capture.photos import is_photo_source
-    from difftetvr.capture.volume import is_volume_file
-    from difftetvr.capture.volume_capture import TOOTH
+    from difftetvr.capture.photos.photo_capture import is_photo_source
+    from difftetvr.capture.volumes.volume import is_volume_file
+    from difftetvr.capture.volumes.volume_capture import TOOTH
     from difftetvr.mesh.io import is_mesh_archive
 
     is_saved_capture = path.suffix.lower() == ".npz" and path.is_file() and not is_mesh_archive(path)

@@ -14,16 +14,15 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from difftetvr.cli.options import CaptureOptions, Output
 from difftetvr.cli.saved import SavedRun, saved_run
-from difftetvr.errors import counted
-from difftetvr.fit.config import CHOSEN_FOR_CAPTURE, FitConfig
-from difftetvr.fit.errors import FitError
-from difftetvr.fit.folder import RunFolder
+from difftetvr.errors import FitError, counted
+from difftetvr.fitting.config import CHOSEN_FOR_CAPTURE, FitConfig
+from difftetvr.fitting.records.folder import RunFolder
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from difftetvr.fit.result import FitResult
-    from difftetvr.fit.trainer import Trainer
+    from difftetvr.fitting.records.result import FitResult
+    from difftetvr.fitting.trainer import Trainer
 
 
 @dataclass(frozen=True)
@@ -48,7 +47,7 @@ class Fit:
 
     def run(self, console: Console) -> None:
         """Fits, and fills the output folder."""
-        from difftetvr.fit.loop import prepare
+        from difftetvr.fitting.loop import prepare
         from difftetvr.view.report import write_report
 
         folder = RunFolder(self.output)
@@ -70,8 +69,8 @@ class Fit:
         _print_summary(console, result.metrics, folder)
 
     def _optimise(self, trainer: Trainer, folder: RunFolder, console: Console) -> FitResult:
-        from difftetvr.fit.loop import optimise
-        from difftetvr.fit.progress import ProgressDisplay
+        from difftetvr.fitting.loop import optimise
+        from difftetvr.fitting.records.progress import ProgressDisplay
 
         try:
             with ProgressDisplay(console) as display:

@@ -75,8 +75,8 @@ class Mesh:
             )
 
     def _of_box(self, box: tuple[float, ...]) -> TetMesh:
-        from difftetvr.mesh.generators import grid_cubes
-        from difftetvr.mesh.surfaces import MesherOptions, tetrahedralize_box
+        from difftetvr.mesh.making.generators import grid_cubes
+        from difftetvr.mesh.making.surfaces import MesherOptions, tetrahedralize_box
         from difftetvr.mesh.tetmesh import TetMesh
 
         lower, upper = box[:3], box[3:]
@@ -89,7 +89,7 @@ class Mesh:
         return tetrahedralize_box(lower, upper, self.mesher, options)  # type: ignore[arg-type]
 
     def _of_file(self, source: Path, console: Console) -> TetMesh:
-        from difftetvr.mesh.surfaces import MesherOptions, load_surface, open_edges, tetrahedralize
+        from difftetvr.mesh.making.surfaces import MesherOptions, load_surface, open_edges, tetrahedralize
         from difftetvr.mesh.tetmesh import TetMesh
 
         if self.mesher == "delaunay":
@@ -142,7 +142,7 @@ def load_points(path: Path) -> NDArray[Any]:
 def _meshio_points(path: Path) -> NDArray[Any]:
     import meshio  # late: it loads every format it knows
 
-    from difftetvr.mesh.surfaces import require_whole
+    from difftetvr.mesh.making.surfaces import require_whole
 
     require_whole(path)
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):

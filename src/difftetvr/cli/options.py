@@ -72,7 +72,7 @@ class CaptureOptions:
             console: Where to say what was chosen.
         """
         from difftetvr.capture import CaptureWarning, PhotoCapture, is_photo_source
-        from difftetvr.fit.requirements import resolve_device
+        from difftetvr.fitting.beginning.requirements import resolve_device
 
         if self.downscale is not None or not (self.format or is_photo_source(name)):
             return self
@@ -133,7 +133,7 @@ def load_model(
         options: How to read the file.
         console: Where to say what was left out of it.
     """
-    from difftetvr.fit.requirements import resolve_device
+    from difftetvr.fitting.beginning.requirements import resolve_device
 
     data = (options or MeshOptions()).load(path, console, require_field=True)
     assert data.field is not None

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import torch
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from difftetvr.cli.options import MeshOptions, Output
@@ -16,11 +15,12 @@ from difftetvr.errors import CameraError, CaptureError, MeshError, counted
 from difftetvr.files import require_writable
 
 if TYPE_CHECKING:
+    import torch
     from rich.console import Console
 
     from difftetvr.mesh import Field, TetMesh
     from difftetvr.mesh.io import MeshData
-    from difftetvr.render import Camera, ScalarField
+    from difftetvr.rendering import Camera, ScalarField
 
 # Where the default camera stands, seen from the mesh: in front, to the right, a little above.
 _DEFAULT_DIRECTION = (0.45, -1.0, 0.35)
@@ -44,8 +44,10 @@ class ScalarOptions:
         """What to render of a file, and the name of the scalar, if it is one."""
         if self.scalar is None and data.field is not None:
             return data.field, None
+        import torch
+
         from difftetvr.optics.transfer_function import TransferFunction
-        from difftetvr.render import ScalarField
+        from difftetvr.rendering import ScalarField
 
         if not (math.isfinite(self.attenuation) and self.attenuation >= 0):
             raise MeshError(f"--attenuation is {self.attenuation:g}; it must be finite and not negative.")
@@ -117,8 +119,8 @@ class Render:
 
     def run(self, console: Console) -> None:
         """Renders and writes the picture."""
-        from difftetvr.fit.requirements import resolve_device
-        from difftetvr.render import OrderWarning
+        from difftetvr.fitting.beginning.requirements import resolve_device
+        from difftetvr.rendering import OrderWarning
         from difftetvr.view.pictures import require_png
 
         require_png(self.output)
@@ -137,7 +139,9 @@ class Render:
             console.print(str(warning.message), highlight=False)
 
     def _draw_image(self, data: MeshData, mesh: TetMesh, console: Console) -> None:
-        from difftetvr.render import render
+        import torch
+
+        from difftetvr.rendering import render
         from difftetvr.view.pictures import save_png
 
         content, name = self.scalars.apply(data, self.model)
@@ -155,7 +159,7 @@ class Render:
         console.print(f"Wrote {self.output} ({self.width} x {self.height}{what})", highlight=False)
 
     def _draw_statistics(self, mesh: TetMesh, console: Console) -> None:
-        from difftetvr.render.inspection import inspect_rays
+        from difftetvr.rendering.inspection import inspect_rays
         from difftetvr.view.heatmap import Scale, save_heatmap
 
         statistics = inspect_rays(mesh, self._camera(mesh), self.renderer, self.clip)
@@ -181,7 +185,9 @@ class Render:
                 raise CameraError(f"--{name} is {given}; give three finite numbers.")
 
     def _camera(self, mesh: TetMesh) -> Camera:
-        from difftetvr.render.camera import Camera
+        import torch
+
+        from difftetvr.rendering.cameras.pinhole import Camera
 
         lower, upper = mesh.bounds().double().cpu()
         target = torch.tensor(self.target, dtype=torch.float64) if self.target else 0.5 * (lower + upper)

@@ -13,11 +13,10 @@ import tyro
 from tyro.conf import FlagCreatePairsOff, arg
 
 from difftetvr.cli.options import CaptureOptions
-from difftetvr.errors import DiffTetError
-from difftetvr.fit.config import FitConfig
-from difftetvr.fit.errors import FitError
-from difftetvr.fit.folder import RunFolder
-from difftetvr.fit.options import options_from_json
+from difftetvr.errors import DiffTetError, FitError
+from difftetvr.fitting.config import FitConfig
+from difftetvr.fitting.options import options_from_json
+from difftetvr.fitting.records.folder import RunFolder
 
 _LEFT_OPEN: dict[str, Any] = {"capture": None, "capture_options": {}, "fit": {}}
 

@@ -1,32 +1,9 @@
-"""What a tetrahedral mesh is: positions, cells, topology, quality, the field on it, and how its cells change."""
+"""What is a tetrahedral mesh, what is known about it, and how far may its vertices move?
 
-from difftetvr.mesh.bisection import bisect_edges, independent_edges, long_edges
-from difftetvr.mesh.change import MeshChange
-from difftetvr.mesh.collapse import collapse_edges
-from difftetvr.mesh.field import Field
-from difftetvr.mesh.flip_search import find_flips
-from difftetvr.mesh.flips import Flips, apply_flips, independent_flips
-from difftetvr.mesh.insertion import DelaunayInsertion, insert_delaunay
-from difftetvr.mesh.removal import remove_cells
-from difftetvr.mesh.star import star_subdivision
-from difftetvr.mesh.tetmesh import TetMesh
-from difftetvr.mesh.topology import Topology
+Positions, cells and the field on them stand here; inner rooms hold how cells meet (`topology`), where meshes come from
+(`making`), how their cells change (`changes`) and their files (`io`).
+"""
 
-__all__ = [
-    "DelaunayInsertion",
-    "Field",
-    "Flips",
-    "MeshChange",
-    "TetMesh",
-    "Topology",
-    "apply_flips",
-    "bisect_edges",
-    "collapse_edges",
-    "find_flips",
-    "independent_edges",
-    "independent_flips",
-    "insert_delaunay",
-    "long_edges",
-    "remove_cells",
-    "star_subdivision",
-]
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -8,10 +8,10 @@ import torch
 
 from difftetvr.mesh import quality
 from difftetvr.mesh.arrays import true_indices
-from difftetvr.mesh.incidence import boundary_vertices, shell, stars
 from difftetvr.mesh.shapes import length_scale
 from difftetvr.mesh.tetmesh import TetMesh
-from difftetvr.mesh.topology import Topology
+from difftetvr.mesh.topology.incidence import boundary_vertices, shell, stars
+from difftetvr.mesh.topology.topology import Topology
 
 _PAIRS_AT_ONCE = 2**16
 

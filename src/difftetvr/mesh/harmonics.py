@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import torch
 
-MAX_DEGREE = 3
-"""Highest band there is a basis for."""
-
 COUNTS = (0, 3, 8, 15)
 """Number of functions in the bands 1 to each degree."""
 

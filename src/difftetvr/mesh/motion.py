@@ -6,40 +6,15 @@ from dataclasses import dataclass
 
 import torch
 
-from difftetvr.errors import MeshError
 from difftetvr.mesh.arrays import true_indices
-from difftetvr.mesh.incidence import stars
+from difftetvr.mesh.limits import MotionLimits
 from difftetvr.mesh.shapes import CellShapes, length_scale, measure_cells, scaled_axes
 from difftetvr.mesh.tetmesh import TetMesh
-from difftetvr.mesh.topology import Topology
+from difftetvr.mesh.topology.incidence import stars
+from difftetvr.mesh.topology.topology import Topology
 
 _CERTAIN_QUALITY = 1e-13
 """Above this, rounding cannot have changed the sign of a volume: its error is below 4.6e-14 in units of Q."""
-
-
-@dataclass(frozen=True)
-class MotionLimits:
-    """What no cell may fall under when vertices move.
-
-    Attributes:
-        volume_ratio: A cell keeps at least this fraction of its volume in one move, in (0, 1).
-        quality: No cell's quality Q falls below this, in [0, 1); cells that are below it already may only rise.
-        halvings: How often a move is halved before it is refused altogether, 0 to 60.
-
-    Raises:
-        MeshError: A limit is out of range.
-    """
-
-    volume_ratio: float = 0.1
-    quality: float = 0.05
-    halvings: int = 6
-
-    def __post_init__(self) -> None:
-        if not (0 < self.volume_ratio < 1 and 0 <= self.quality < 1 and 0 <= self.halvings <= 60):
-            raise MeshError(
-                f"{self} is out of range; pass a volume_ratio between 0 and 1, a quality of at least 0 and below 1, "
-                "and 0 to 60 halvings."
-            )
 
 
 @dataclass(frozen=True)

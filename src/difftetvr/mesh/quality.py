@@ -12,7 +12,7 @@ from collections.abc import Callable
 import torch
 
 from difftetvr.mesh.arrays import chunks
-from difftetvr.mesh.topology import LOCAL_EDGES
+from difftetvr.mesh.topology.topology import LOCAL_EDGES
 
 _REGULAR_TETRAHEDRON = 6.0 * 2.0**0.5
 """Edge length cubed over volume of the regular tetrahedron."""

@@ -15,7 +15,7 @@ import torch
 
 from difftetvr.mesh.arrays import chunks
 from difftetvr.mesh.tetmesh import TetMesh
-from difftetvr.mesh.topology import Topology
+from difftetvr.mesh.topology.topology import Topology
 
 _QUALITY_FACTOR = math.sqrt(432.0)
 """Q = sqrt(432) det / S^(3/2), S the sum of the squared edge lengths: the same as 6 sqrt(2) V / l_rms^3."""

@@ -8,10 +8,11 @@ from typing import Any
 import torch
 
 from difftetvr.errors import MeshError
-from difftetvr.mesh import generators, quality, validation
+from difftetvr.mesh import quality, validation
 from difftetvr.mesh.arrays import true_indices
-from difftetvr.mesh.delaunay import delaunay as triangulate
-from difftetvr.mesh.topology import Topology
+from difftetvr.mesh.making import generators
+from difftetvr.mesh.making.delaunay import delaunay as triangulate
+from difftetvr.mesh.topology.topology import Topology
 
 
 class TetMesh:
@@ -109,7 +110,7 @@ class TetMesh:
         """The Delaunay mesh of the convex hull of points.
 
         Flat cells are dropped from the hull only, never from the interior; ties between cospherical points are broken
-        such that neither flat cells nor mismatched faces remain (see `difftetvr.mesh.delaunay`).
+        such that neither flat cells nor mismatched faces remain (see `difftetvr.mesh.making.delaunay`).
 
         Args:
             points: (V, 3) positions, array-like; kept as the vertices, in order and with their autograd graph.

@@ -10,7 +10,7 @@ import torch
 
 from difftetvr.errors import MeshError
 from difftetvr.mesh.arrays import chunks, true_indices
-from difftetvr.mesh.faces import MAX_CELLS
+from difftetvr.mesh.limits import MAX_CELLS
 
 _SIGN_CERTAIN = 2.0**-48
 """A determinant above this times the product of its three edges' lengths has a certain sign in float64.

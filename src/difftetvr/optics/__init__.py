@@ -1,9 +1,8 @@
-"""What light does inside one cell: weights of the end colours, transmittance, and their adjoints."""
+"""What does light do inside one cell: weights of the end colours, transmittance, and their adjoints?
 
-from difftetvr.optics.constant import ConstantPerCell
-from difftetvr.optics.exact import ExactLinear
-from difftetvr.optics.model import OpticalModel
-from difftetvr.optics.subsegments import SubSegments
-from difftetvr.optics.transfer_function import TransferFunction
+Models of a crossing, and transfer functions.
+"""
 
-__all__ = ["ConstantPerCell", "ExactLinear", "OpticalModel", "SubSegments", "TransferFunction"]
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -8,7 +8,14 @@ from PIL import Image, ImageOps
 
 from difftetvr.capture.capture import Capture
 from difftetvr.errors import CaptureError, counted
-from difftetvr.fit.evaluation import Evaluation, evaluate, rendered_image, true_image, usual_background, valid_share
+from difftetvr.fitting.records.evaluation import (
+    Evaluation,
+    evaluate,
+    rendered_image,
+    true_image,
+    usual_background,
+    valid_share,
+)
 from difftetvr.mesh.field import Field
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.view.cut import Plane, cut_picture

@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw
 from difftetvr.errors import MeshError
 from difftetvr.mesh.field import Field
 from difftetvr.mesh.tetmesh import TetMesh
-from difftetvr.mesh.topology import LOCAL_EDGES
+from difftetvr.mesh.topology.topology import LOCAL_EDGES
 
 _SMOOTHING = 2  # lines are drawn so many times larger, and shrunk
 _PIXELS_AT_ONCE = 2_000_000

@@ -11,10 +11,10 @@ from rich.table import Table
 from rich.text import Text
 
 from difftetvr.capture.capture import Capture
-from difftetvr.fit.evaluation import Evaluation
-from difftetvr.mesh.delaunay_check import is_convex, is_delaunay
+from difftetvr.fitting.records.evaluation import Evaluation
 from difftetvr.mesh.field import Field
 from difftetvr.mesh.harmonics import COUNTS
+from difftetvr.mesh.making.delaunay_check import is_convex, is_delaunay
 from difftetvr.mesh.tetmesh import TetMesh
 
 _QUALITY_BINS = 10

@@ -10,7 +10,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from difftetvr.errors import CaptureError
 from difftetvr.files import atomic_write
-from difftetvr.fit.metrics import psnr
+from difftetvr.fitting.metrics import psnr
 
 _DIFFERENCE_GAIN = 4
 _LEAST_PANEL = 256

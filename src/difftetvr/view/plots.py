@@ -8,9 +8,9 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from difftetvr.errors import FitError
 from difftetvr.files import atomic_write
-from difftetvr.fit.errors import FitError
-from difftetvr.fit.history import History, RefinementRecord
+from difftetvr.fitting.records.history import History, RefinementRecord
 
 _SMOOTHING = 64
 

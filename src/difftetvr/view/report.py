@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from difftetvr.capture.capture import Capture
 from difftetvr.errors import CaptureError
-from difftetvr.fit.evaluation import rendered_image, true_image, valid_share, where_valid
-from difftetvr.fit.folder import RunFolder, write_json
-from difftetvr.fit.result import FitResult
+from difftetvr.fitting.records.evaluation import rendered_image, true_image, valid_share, where_valid
+from difftetvr.fitting.records.folder import RunFolder, write_json
+from difftetvr.fitting.records.result import FitResult
 from difftetvr.mesh.io import save
 from difftetvr.view.cut import cut_picture
 from difftetvr.view.pictures import save_comparisons, save_picture, save_png

@@ -12,11 +12,11 @@ import torch
 
 from difftetvr.errors import MeshError, counted
 from difftetvr.mesh import validation
-from difftetvr.mesh.conversion import CONVERTIBLE, is_quadratic, num_nodes, to_tetrahedra
 from difftetvr.mesh.field import Field, Location
-from difftetvr.mesh.io import bintet, gmsh, medit, npz, ovm, tetgen, through_meshio, vtk
 from difftetvr.mesh.io.content import CellBlock, Content, require_array
-from difftetvr.mesh.repair import repair
+from difftetvr.mesh.io.formats import bintet, gmsh, medit, npz, ovm, tetgen, through_meshio, vtk
+from difftetvr.mesh.making.conversion import CONVERTIBLE, is_quadratic, num_nodes, to_tetrahedra
+from difftetvr.mesh.making.repair import repair
 from difftetvr.mesh.tetmesh import TetMesh
 
 FIELD_ARRAYS = ("color", "density")
@@ -101,7 +101,8 @@ def load(
         dtype: Floating-point type of vertices, colours and densities. Files of this type round-trip to the bit.
         split: Split hexahedra, wedges and pyramids into tetrahedra, and straighten quadratic cells.
         flat: What becomes of cells of exactly zero volume: "drop" leaves them out, which changes no picture; "repair"
-            mends the mesh so that it can be deformed, too (see `difftetvr.mesh.repair`); "refuse" makes them an error.
+            mends the mesh so that it can be deformed, too (see `difftetvr.mesh.making.repair`); "refuse" makes them an
+            error.
 
     Raises:
         MeshError: The file cannot be read, holds other volume cells than tetrahedra, an invalid mesh, or no point or

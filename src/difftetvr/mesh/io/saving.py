@@ -11,7 +11,7 @@ import torch
 from difftetvr.errors import MeshError
 from difftetvr.files import atomic_write
 from difftetvr.mesh.field import Field
-from difftetvr.mesh.io import bintet, npz, ovm, tetgen, through_meshio
+from difftetvr.mesh.io.formats import bintet, npz, ovm, tetgen, through_meshio
 from difftetvr.mesh.io.loading import HARMONICS
 from difftetvr.mesh.tetmesh import TetMesh
 
@@ -105,7 +105,7 @@ def _arrays(path: Path, field: Field | None) -> dict[str, np.ndarray]:
 
 
 def _write_xdmf(path: Path, *content: Any) -> None:
-    from difftetvr.mesh.io import xdmf  # late: it loads meshio and so every format that meshio knows
+    from difftetvr.mesh.io.formats import xdmf  # late: it loads meshio and so every format that meshio knows
 
     xdmf.write(path, *content)
 

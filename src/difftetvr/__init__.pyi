@@ -1,0 +1,73 @@
+from . import backend as backend
+from . import capture as capture
+from . import errors as errors
+from . import fitting as fitting
+from . import mesh as mesh
+from . import optics as optics
+from . import rendering as rendering
+from . import view as view
+from ._version import __version__ as __version__
+from .capture.capture import Capture as Capture
+from .capture.loading import load_capture as load_capture
+from .capture.photos.photo_capture import PhotoCapture as PhotoCapture
+from .capture.volumes.volume import Volume as Volume
+from .capture.volumes.volume_capture import VolumeCapture as VolumeCapture
+from .errors import BackendError as BackendError
+from .errors import CameraError as CameraError
+from .errors import CaptureError as CaptureError
+from .errors import DiffTetError as DiffTetError
+from .errors import FitError as FitError
+from .errors import MeshError as MeshError
+from .fitting.config import FitConfig as FitConfig
+from .fitting.loop import fit as fit
+from .fitting.records.result import FitResult as FitResult
+from .mesh.field import Field as Field
+from .mesh.io.loading import MeshData as MeshData
+from .mesh.io.loading import load as load
+from .mesh.io.loading import load_data as load_data
+from .mesh.io.loading import load_mesh as load_mesh
+from .mesh.io.saving import save as save
+from .mesh.tetmesh import TetMesh as TetMesh
+from .optics.transfer_function import TransferFunction as TransferFunction
+from .rendering.api import RenderedImage as RenderedImage
+from .rendering.api import render as render
+from .rendering.cameras.pinhole import Camera as Camera
+from .rendering.scalar_field import ScalarField as ScalarField
+
+__all__ = [
+    "BackendError",
+    "Camera",
+    "CameraError",
+    "Capture",
+    "CaptureError",
+    "DiffTetError",
+    "Field",
+    "FitConfig",
+    "FitError",
+    "FitResult",
+    "MeshData",
+    "MeshError",
+    "PhotoCapture",
+    "RenderedImage",
+    "ScalarField",
+    "TetMesh",
+    "TransferFunction",
+    "Volume",
+    "VolumeCapture",
+    "__version__",
+    "backend",
+    "capture",
+    "errors",
+    "fit",
+    "fitting",
+    "load",
+    "load_capture",
+    "load_data",
+    "load_mesh",
+    "mesh",
+    "optics",
+    "render",
+    "rendering",
+    "save",
+    "view",
+]

@@ -1,0 +1,49 @@
+from . import capture as capture
+from . import capture_file as capture_file
+from . import free_space as free_space
+from . import hull as hull
+from . import loading as loading
+from . import orbit as orbit
+from . import packed as packed
+from . import photos as photos
+from . import viewing as viewing
+from . import volumes as volumes
+from .capture import Capture as Capture
+from .loading import load_capture as load_capture
+from .orbit import fibonacci_orbit as fibonacci_orbit
+from .orbit import random_orbit as random_orbit
+from .packed import PackedImages as PackedImages
+from .photos.photo_capture import PhotoCapture as PhotoCapture
+from .photos.photo_capture import is_photo_source as is_photo_source
+from .photos.photo_set import CaptureWarning as CaptureWarning
+from .volumes.volume import Volume as Volume
+from .volumes.volume import is_volume_file as is_volume_file
+from .volumes.volume_capture import TOOTH as TOOTH
+from .volumes.volume_capture import VolumeCapture as VolumeCapture
+from .volumes.volume_renderer import VolumeRenderer as VolumeRenderer
+
+__all__ = [
+    "TOOTH",
+    "Capture",
+    "CaptureWarning",
+    "PackedImages",
+    "PhotoCapture",
+    "Volume",
+    "VolumeCapture",
+    "VolumeRenderer",
+    "capture",
+    "capture_file",
+    "fibonacci_orbit",
+    "free_space",
+    "hull",
+    "is_photo_source",
+    "is_volume_file",
+    "load_capture",
+    "loading",
+    "orbit",
+    "packed",
+    "photos",
+    "random_orbit",
+    "viewing",
+    "volumes",
+]

@@ -1,0 +1,54 @@
+"""Captures from whatever a user names: the packaged scan, volumes, photographs, saved captures."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from difftetvr.capture.capture import Capture
+from difftetvr.capture.photos.photo_capture import PhotoCapture, is_photo_source
+from difftetvr.capture.volumes.volume import is_volume_file
+from difftetvr.capture.volumes.volume_capture import TOOTH, VolumeCapture
+from difftetvr.errors import CaptureError
+
+
+def load_capture(source: str | Path, **overrides: Any) -> Capture:
+    """Images and cameras from whatever ``source`` is.
+
+    Args:
+        source: ``tooth`` for the packaged scan, a volume file (``.raw``, ``.dat``, ``.nrrd``, ``.nhdr``, ``.vti``), a
+            capture saved as ``.npz``, or photographs with known cameras: a folder (NeRF-synthetic, nerfstudio,
+            instant-ngp, COLMAP, or with a cameras.json of our own), such a ``.json`` file, or a tiny NeRF ``.npz``.
+        **overrides: Fields of :class:`VolumeCapture` for the tooth and for volumes; a volume needs at least
+            ``transfer_function``. Fields of :class:`PhotoCapture` for photographs. None stands for the field's default.
+
+    Raises:
+        CaptureError: The source or an override is not known or not valid.
+    """
+    chosen = {key: value for key, value in overrides.items() if value is not None}
+    kind = _kind(source, chosen)
+    if kind is None:
+        if chosen:
+            raise CaptureError(f"The saved capture '{source}' is read as it is; leave out '{sorted(chosen)[0]}'.")
+        return Capture.load(source)
+    known = {field.name for field in fields(kind)} - {"path"}
+    unknown = sorted(set(chosen) - known)
+    if unknown:
+        what = "A capture of photos" if kind is PhotoCapture else "A capture of a volume"
+        raise CaptureError(f"{what} has no setting '{unknown[0]}'; known are {', '.join(sorted(known))}.")
+    return kind(path=str(source), **chosen).build()
+
+
+def _kind(source: str | Path, chosen: dict[str, Any]) -> type[VolumeCapture | PhotoCapture] | None:
+    """What describes a source; None for a saved capture, which describes itself."""
+    if str(source) == TOOTH or is_volume_file(source):
+        return VolumeCapture
+    if "format" in chosen or is_photo_source(source):
+        return PhotoCapture
+    if Path(source).suffix.lower() == ".npz":
+        return None
+    raise CaptureError(
+        f"'{source}' is no capture: give 'tooth', a volume (.raw, .dat, .nrrd, .nhdr, .vti), a saved capture (.npz), "
+        "or a folder of photos with their cameras."
+    )

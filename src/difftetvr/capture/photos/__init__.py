@@ -1,0 +1,8 @@
+"""How do photographs whose cameras are known become a capture: lenses, masks, sizes, the box that holds the scene?
+
+`readers` finds views in the files of other programs; what is here decodes, undistorts and bounds them.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

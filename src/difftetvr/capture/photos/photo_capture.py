@@ -1,0 +1,220 @@
+"""Captures from photographs, or renderings, whose cameras are known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+import torch
+
+from difftetvr.capture.capture import Capture
+from difftetvr.capture.hull import silhouettes
+from difftetvr.capture.packed import PackedImages
+from difftetvr.capture.photos.bounds import hull_bounds, point_bounds, require_resolved, require_seen, surroundings_of
+from difftetvr.capture.photos.photo_load import fitting_downscale, load_photos, make_camera, present_views
+from difftetvr.capture.photos.photo_set import PhotoSet, read_json
+from difftetvr.capture.photos.readers.camera_list import CAMERAS_FORMAT, read_camera_list
+from difftetvr.capture.photos.readers.colmap import find_colmap_model, read_colmap
+from difftetvr.capture.photos.readers.tiny_nerf import is_tiny_nerf, read_tiny_nerf
+from difftetvr.capture.photos.readers.transforms import read_nerf_synthetic, read_transforms
+from difftetvr.errors import CaptureError
+from difftetvr.rendering.cameras.pinhole import Camera
+
+PhotoFormat = Literal["nerf-synthetic", "transforms", "colmap", "cameras", "tiny-nerf"]
+
+_READERS = {
+    "nerf-synthetic": read_nerf_synthetic,
+    "transforms": read_transforms,
+    "colmap": read_colmap,
+    "cameras": read_camera_list,
+}
+# Every 8th view, the convention since mip-NeRF 360.
+_TEST_EVERY = 8
+_MOST_DOWNSCALE = 1024
+
+
+@dataclass(frozen=True)
+class PhotoCapture:
+    """Photographs with known cameras, in one of the formats of this field; docs/captures.md says which.
+
+    Attributes:
+        path: Folder, ``.json`` or ``.npz`` file.
+        format: What it is; None finds out by looking.
+        downscale: Pixels of an image along x and y that are averaged to one.
+        test_every: One of so many views, by name, is held out, beginning with the first; 0 holds out none. None stands
+            for 8 where the format does not say itself which views are held out.
+        bounds: Lower and upper corner of the box to reconstruct, (x, y, z, x, y, z); None finds it by the images'
+            alpha, the sparse points or the cameras.
+    """
+
+    path: str
+    format: PhotoFormat | None = None
+    downscale: int = 1
+    test_every: int | None = None
+    bounds: tuple[float, float, float, float, float, float] | None = None
+
+    def fitting_downscale(self, longest_side: int) -> int:
+        """The least ``downscale`` with which images have at most so many pixels along their longer side, or nearly so.
+
+        Args:
+            longest_side: Pixels, >= 1.
+
+        Raises:
+            CaptureError: There is no such capture, or its first image cannot be read.
+        """
+        self._check()
+        path = Path(self.path)
+        kind = self.format or find_format(path)
+        # Archives of tiny NeRFs are tiny.
+        return 1 if kind == "tiny-nerf" else fitting_downscale(self._read(kind, path), longest_side)
+
+    def build(self) -> Capture:
+        """Read cameras and images.
+
+        Raises:
+            CaptureError: A file or a value is not valid.
+        """
+        self._check()
+        path = Path(self.path)
+        kind = self.format or find_format(path)
+        if kind == "tiny-nerf":
+            return self._build_tiny_nerf(path)
+        photo_set = self._read(kind, path)
+        photo_set.views = present_views(photo_set, self.downscale)
+        given = torch.tensor([view.is_test for view in photo_set.views]) if photo_set.has_split else None
+        test = self._test_mask(given, len(photo_set.views), photo_set.name)
+        photos = load_photos(photo_set, self.downscale)
+        bounds, surroundings = self._find_bounds(photo_set, photos.cameras, photos.images, photos.alphas, test)
+        return Capture(
+            photos.cameras,
+            photos.images,
+            photos.alphas,
+            test,
+            bounds,
+            photo_set.name,
+            encoding="srgb",
+            valid=photos.valid,
+            points=_tensor(photo_set.points),
+            point_colors=_tensor(photo_set.point_colors),
+            surroundings=surroundings,
+        )
+
+    @staticmethod
+    def _read(kind: PhotoFormat, path: Path) -> PhotoSet:
+        if not path.exists():
+            raise CaptureError(f"There is no '{path}'; check the path of the capture.")
+        return _READERS[kind](path)
+
+    def _build_tiny_nerf(self, path: Path) -> Capture:
+        content = read_tiny_nerf(path, self.downscale)
+        cameras = [
+            make_camera(content.intrinsics, torch.from_numpy(pose), f"view {index} of '{path}'")
+            for index, pose in enumerate(content.poses)
+        ]
+        test = self._test_mask(None, len(cameras), path.stem)
+        bounds, surroundings = self._find_bounds(PhotoSet(path.stem), cameras, content.images, content.alphas, test)
+        return Capture(
+            cameras,
+            content.images,
+            content.alphas,
+            test,
+            bounds,
+            path.stem,
+            encoding="srgb",
+            surroundings=surroundings,
+        )
+
+    def _check(self) -> None:
+        if self.format is not None and self.format not in get_args(PhotoFormat):
+            raise CaptureError(f"The format is '{self.format}'; it must be one of {', '.join(get_args(PhotoFormat))}.")
+        if not 1 <= self.downscale <= _MOST_DOWNSCALE:
+            raise CaptureError(
+                f"The downscale is {self.downscale}; it must be at least 1 and at most {_MOST_DOWNSCALE}."
+            )
+        if self.test_every is not None and (self.test_every < 0 or self.test_every == 1):
+            raise CaptureError(f"The test_every is {self.test_every}; it must be 0 or at least 2.")
+
+    def _test_mask(self, given: torch.Tensor | None, count: int, name: str) -> torch.Tensor:
+        if given is not None:
+            if self.test_every is not None:
+                raise CaptureError(f"'{name}' says itself which views are held out; leave out test_every.")
+            return given
+        every = _TEST_EVERY if self.test_every is None else self.test_every
+        return torch.arange(count) % every == 0 if every else torch.zeros(count, dtype=torch.bool)
+
+    def _find_bounds(
+        self,
+        photo_set: PhotoSet,
+        cameras: list[Camera],
+        images: torch.Tensor | PackedImages,
+        alphas: torch.Tensor | PackedImages | None,
+        test: torch.Tensor,
+    ) -> tuple[torch.Tensor, float]:
+        """(2, 3) float32 bounds, and the surroundings' factor; only images for training are looked at."""
+        train = (~test).nonzero().flatten().tolist() or list(range(len(cameras)))
+        seeing = [cameras[view] for view in train]
+        masks = silhouettes(images, alphas, train)
+        if self.bounds is not None:
+            box = np.array(self.bounds, dtype=np.float64).reshape(2, 3)
+        elif photo_set.bounds is not None:
+            box = photo_set.bounds
+        elif masks is not None:
+            box = hull_bounds(seeing, masks)
+        elif photo_set.points is not None:
+            box = point_bounds(photo_set.points, seeing)
+        elif photo_set.rough_bounds is not None:
+            box = photo_set.rough_bounds
+        else:
+            box = hull_bounds(seeing, None)
+        surroundings = 1.0
+        if np.isfinite(box).all() and (box[0] < box[1]).all():
+            # A box that is given may be of something that few cameras look at.
+            require_seen(box, seeing, photo_set.name, most_blind=0.5 if self.bounds is None else 0.75)
+            require_resolved(box, photo_set.name)
+            surroundings = 1.0 if masks is not None else surroundings_of(box, seeing)
+        return torch.from_numpy(box.astype(np.float32)), surroundings
+
+
+def is_photo_source(source: str | Path) -> bool:
+    """Whether something can only be a photo capture: a folder, a ``.json`` file or a tiny NeRF archive."""
+    path = Path(source)
+    suffix = path.suffix.lower()
+    return path.is_dir() or (path.is_file() and (suffix == ".json" or (suffix == ".npz" and is_tiny_nerf(path))))
+
+
+def find_format(path: Path) -> PhotoFormat:
+    """What kind of photo capture lies at a path.
+
+    Raises:
+        CaptureError: None that is known.
+    """
+    if path.is_dir():
+        if (path / "transforms_train.json").is_file():
+            return "nerf-synthetic"
+        if (path / "transforms.json").is_file():
+            return "transforms"
+        if _is_camera_list(path / "cameras.json"):
+            return "cameras"
+        if find_colmap_model(path) is not None:
+            return "colmap"
+    elif path.suffix.lower() == ".json":
+        return "cameras" if _is_camera_list(path) else "transforms"
+    elif path.suffix.lower() == ".npz":
+        return "tiny-nerf"
+    raise CaptureError(
+        f"'{path}' holds no capture that is known: neither transforms.json, transforms_train.json, a sparse model of "
+        "COLMAP nor our cameras.json; see docs/captures.md."
+    )
+
+
+def _is_camera_list(path: Path) -> bool:
+    try:
+        return path.is_file() and read_json(path).get("format") == CAMERAS_FORMAT
+    except CaptureError:
+        return False
+
+
+def _tensor(values: np.ndarray | None) -> torch.Tensor | None:
+    return None if values is None else torch.from_numpy(values.astype(np.float32))

@@ -1,0 +1,17 @@
+from . import camera_list as camera_list
+from . import colmap as colmap
+from . import colmap_binary as colmap_binary
+from . import colmap_model as colmap_model
+from . import colmap_text as colmap_text
+from . import tiny_nerf as tiny_nerf
+from . import transforms as transforms
+
+__all__ = [
+    "camera_list",
+    "colmap",
+    "colmap_binary",
+    "colmap_model",
+    "colmap_text",
+    "tiny_nerf",
+    "transforms",
+]

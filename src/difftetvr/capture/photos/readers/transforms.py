@@ -1,0 +1,171 @@
+"""Captures described by transforms.json: NeRF-synthetic, nerfstudio and instant-ngp.
+
+Sources: the data of NeRF (Mildenhall et al. 2020), https://docs.nerf.studio/quickstart/data_conventions.html and
+docs/nerf_dataset_tips.md of instant-ngp. All three store camera-to-world in OpenGL axes.
+"""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from difftetvr.capture.photos.lens import Distortion, Lens
+from difftetvr.capture.photos.photo_set import (
+    CaptureWarning,
+    PhotoSet,
+    View,
+    list_of_objects,
+    number_of,
+    pixels_of,
+    read_json,
+    text_of,
+)
+from difftetvr.capture.photos.poses import from_opengl
+from difftetvr.errors import CaptureError
+
+_PINHOLES = ("", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL")
+# instant-ngp maps positions p to 0.33 p + (0.5, 0.5, 0.5), and its box is a cube of side aabb_scale around the 0.5s.
+_NGP_SCALE, _NGP_OFFSET, _NGP_CENTER = 0.33, 0.5, 0.5
+
+
+def read_nerf_synthetic(folder: Path) -> PhotoSet:
+    """A folder with transforms_train.json and, for the held-out views, transforms_test.json or transforms_val.json.
+
+    Views for validation are used only where no image for testing is present. All images for training must exist; of
+    those for testing, which are often handed on in part, absent ones are skipped with a warning.
+
+    Raises:
+        CaptureError: A file is missing or not valid.
+    """
+    training = folder / "transforms_train.json"
+    train = _views(folder, training, read_json(training), is_test=False)
+    for view in train:
+        if view.file(1) is None:
+            raise CaptureError(
+                f"The training image {view.label} is missing, and a NeRF-synthetic capture needs all of them; "
+                "get the capture anew."
+            )
+    test = _held_out(folder)
+    return PhotoSet(folder.resolve().name, train + test, has_split=bool(test))
+
+
+def read_transforms(path: Path) -> PhotoSet:
+    """A transforms.json of nerfstudio or instant-ngp.
+
+    Intrinsics may stand at the top or, overriding that, in each frame. Distortion is OpenCV's k1, k2, p1, p2, k3.
+    nerfstudio's lists of ``train_filenames`` and ``test_filenames`` (or ``val_filenames``) are kept to.
+    Where there is an ``aabb_scale``, the bounds are instant-ngp's unit cube, by its ``scale`` and ``offset``.
+    Listed images may be absent, as instant-ngp allows.
+
+    Args:
+        path: The file, or its folder.
+
+    Raises:
+        CaptureError: The file is not valid, or the camera model is not supported.
+    """
+    file = path / "transforms.json" if path.is_dir() else path
+    folder, content = file.parent, read_json(file)
+    views = sorted(_views(folder, file, content, is_test=False), key=lambda view: view.name)
+    held_out = _named(content, "test_filenames", file) or _named(content, "val_filenames", file)
+    used = (_named(content, "train_filenames", file) | held_out) or {_plain(view) for view in views}
+    views = [
+        View(v.root, v.name, v.world_to_camera, v.lens, _plain(v) in held_out, v.mask)
+        for v in views
+        if _plain(v) in used
+    ]
+    if not views:
+        raise CaptureError(f"The file names that '{file}' lists for training and testing are none of its frames.")
+    name = folder.resolve().name
+    return PhotoSet(name, views, has_split=bool(held_out), may_miss=True, rough_bounds=_box(content, f"'{file}'"))
+
+
+def _held_out(folder: Path) -> list[View]:
+    for name in ("transforms_test.json", "transforms_val.json"):
+        file = folder / name
+        if not file.is_file():
+            continue
+        views = _views(folder, file, read_json(file), is_test=True)
+        present = [view for view in views if view.file(1) is not None]
+        if len(present) < len(views):
+            missing = len(views) - len(present)
+            warnings.warn(
+                f"{missing} of the {len(views)} images that '{file}' lists are missing; they are left out.",
+                CaptureWarning,
+                stacklevel=2,
+            )
+        if present:
+            return present
+    return []
+
+
+def _views(folder: Path, file: Path, content: dict[str, Any], is_test: bool) -> list[View]:
+    views = []
+    for index, frame in enumerate(list_of_objects(content, "frames", file)):
+        where = f"frame {index} of '{file}'"
+        name = PurePosixPath(text_of(frame, "file_path", where).replace("\\", "/"))
+        # The first folder of the path is the one that smaller copies lie beside.
+        root = folder / name.parts[0] if len(name.parts) > 1 else folder
+        inside = PurePosixPath(*name.parts[1:]) if len(name.parts) > 1 else name
+        pose = from_opengl(frame.get("transform_matrix"), where)
+        mask = folder / text_of(frame, "mask_path", where) if frame.get("mask_path") else None
+        views.append(View(root, str(inside), pose, _lens({**content, **frame}, where), is_test, mask))
+    return views
+
+
+def _lens(values: dict[str, Any], where: str) -> Lens:
+    model = values.get("camera_model") or ""
+    if values.get("is_fisheye") or not isinstance(model, str) or model.upper() not in _PINHOLES:
+        raise CaptureError(
+            f"The camera model of {where} is {model or 'a fisheye'!r}; undistort its images to a pinhole first."
+        )
+
+    def number(key: str) -> float | None:
+        return number_of(values, key, where)
+
+    if number("k4"):
+        raise CaptureError(f"{where[0].upper()}{where[1:]} has the distortion k4, for fisheyes; undistort it first.")
+    distortion = Distortion(**{key: number(key) or 0.0 for key in ("k1", "k2", "p1", "p2", "k3")})
+    return Lens(
+        fx=number("fl_x"),
+        fy=number("fl_y"),
+        cx=number("cx"),
+        cy=number("cy"),
+        angle_x=number("camera_angle_x"),
+        angle_y=number("camera_angle_y"),
+        width=pixels_of(values, "w", where),
+        height=pixels_of(values, "h", where),
+        distortion=distortion,
+    )
+
+
+def _box(content: dict[str, Any], where: str) -> np.ndarray | None:
+    """The unit cube of instant-ngp, where the object should be; None where the file is not for instant-ngp."""
+    side = number_of(content, "aabb_scale", where)
+    if side is None:
+        return None
+    scale = number_of(content, "scale", where) or _NGP_SCALE
+    offset = content.get("offset", _NGP_OFFSET)
+    try:
+        offsets = np.broadcast_to(np.array(offset, dtype=np.float64), (3,))
+    except (TypeError, ValueError):
+        offsets = np.full(3, np.nan)
+    if side <= 0 or not np.isfinite(offsets).all():
+        raise CaptureError(f"The aabb_scale {side:g} or the offset {offset!r} of {where} is not valid; correct them.")
+    center = (_NGP_CENTER - offsets) / scale
+    half = 0.5 / abs(scale)
+    return np.stack([center - half, center + half])
+
+
+def _named(content: dict[str, Any], key: str, file: Path) -> set[str]:
+    names = content.get(key) or []
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise CaptureError(f"'{key}' of '{file}' is no list of file names; correct or remove it.")
+    return {str(PurePosixPath(name)) for name in names}
+
+
+def _plain(view: View) -> str:
+    """The path of a view's image as nerfstudio's lists of files write it."""
+    return str(PurePosixPath(view.root.name) / view.name)

@@ -1,0 +1,21 @@
+from . import readers as readers
+from . import volume as volume
+from . import volume_capture as volume_capture
+from . import volume_file as volume_file
+from . import volume_kernel as volume_kernel
+from . import volume_renderer as volume_renderer
+from .volume import Volume as Volume
+from .volume_capture import VolumeCapture as VolumeCapture
+from .volume_renderer import VolumeRenderer as VolumeRenderer
+
+__all__ = [
+    "Volume",
+    "VolumeCapture",
+    "VolumeRenderer",
+    "readers",
+    "volume",
+    "volume_capture",
+    "volume_file",
+    "volume_kernel",
+    "volume_renderer",
+]

@@ -1,0 +1,5 @@
+from . import nrrd as nrrd
+from . import raw as raw
+from . import vti as vti
+
+__all__ = ["nrrd", "raw", "vti"]

@@ -1,0 +1,135 @@
+"""Captures rendered from a scalar volume and a transfer function."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Literal
+
+import torch
+
+from difftetvr.capture.capture import Capture
+from difftetvr.capture.orbit import DEFAULT_FOV_Y, fibonacci_orbit, random_orbit
+from difftetvr.capture.volumes.volume import Volume
+from difftetvr.capture.volumes.volume_renderer import Progress, VolumeRenderer
+from difftetvr.errors import CameraError, CaptureError
+from difftetvr.optics.transfer_function import TransferFunction
+from difftetvr.rendering.cameras.pinhole import Camera
+
+TOOTH = "tooth"
+_TOOTH_VOLUME = "tooth_103x94x161_uint8.raw.xz"
+_TOOTH_TRANSFER_FUNCTION = "tooth3gauss.json"
+
+
+@dataclass(frozen=True)
+class VolumeCapture:
+    """A volume, its transfer function and the views to render; the defaults are the standard Tooth benchmark.
+
+    Attributes:
+        path: Volume file, or ``tooth`` for the packaged scan.
+        shape: (nx, ny, nz) of a ``.raw`` file that has no header.
+        dtype: NumPy type of a ``.raw`` file that has no header, e.g. ``uint8``.
+        spacing: Distances of samples along (x, y, z); overrides the file's.
+        transfer_function: ``.json`` or ``.xml`` file; the packaged tooth has one of its own.
+        attenuation: Density of opacity 1, per unit of length; the box's longest side is 1.
+        views: Number of views.
+        width: Image width in pixels.
+        height: Image height in pixels.
+        radius: Distance of the cameras from the box's centre.
+        fov_y: Vertical field of view in radians.
+        steps_per_unit: Ray-marching steps per unit of length.
+        test_every: One of so many views is held out; 0 holds out none.
+        test_offset: Index of the first held-out view.
+        seed: Seed of a random orbit.
+        orbit: Whether the cameras lie on a Fibonacci spiral or at random places of the sphere.
+    """
+
+    path: str = TOOTH
+    shape: tuple[int, int, int] | None = None
+    dtype: str | None = None
+    spacing: tuple[float, float, float] | None = None
+    transfer_function: str | None = None
+    attenuation: float = 25.0
+    views: int = 80
+    width: int = 128
+    height: int = 128
+    radius: float = 1.2
+    fov_y: float = DEFAULT_FOV_Y
+    steps_per_unit: float = 2500.0
+    test_every: int = 5
+    test_offset: int = 2
+    seed: int = 0
+    orbit: Literal["fibonacci", "random"] = "fibonacci"
+
+    def build(self, progress: Progress | None = None, device: str | torch.device | None = None) -> Capture:
+        """Read the volume, place the cameras and render the views.
+
+        Args:
+            progress: Called with the number of rendered views and of all views.
+            device: PyTorch device to render on; None takes the fastest. The images are on the CPU in any case.
+
+        Raises:
+            CaptureError: A file or a value is not valid.
+            BackendError: No back end works on the device.
+        """
+        test = self._test_mask()
+        cameras = self.cameras()
+        volume, transfer_function = self.load_volume()
+        if not self.attenuation > 0:
+            raise CaptureError(f"The attenuation is {self.attenuation}; it must be greater than 0.")
+        renderer = VolumeRenderer(volume, transfer_function, self.attenuation, self.steps_per_unit, device)
+        images, alphas = renderer.render(cameras, progress)
+        name = self.path if self.path == TOOTH else Path(self.path).name.split(".")[0]
+        return Capture(cameras, images, alphas, test, volume.bounds, name, self.attenuation)
+
+    def load_volume(self) -> tuple[Volume, TransferFunction]:
+        """The volume and its transfer function.
+
+        Raises:
+            CaptureError: A file is not valid, or the transfer function is missing.
+        """
+        if self.path == TOOTH:
+            if self.shape is not None or self.dtype is not None:
+                raise CaptureError("The packaged tooth says itself what it holds; leave out the shape and the dtype.")
+            with _packaged(_TOOTH_VOLUME) as volume_file, _packaged(_TOOTH_TRANSFER_FUNCTION) as function_file:
+                volume = Volume.load(volume_file, spacing=self.spacing)
+                return volume, TransferFunction.load(self.transfer_function or function_file)
+        if self.transfer_function is None:
+            raise CaptureError(f"The volume '{self.path}' needs a transfer function; give one as .json or .xml.")
+        volume = Volume.load(self.path, self.shape, self.dtype, self.spacing)
+        return volume, TransferFunction.load(self.transfer_function)
+
+    def cameras(self) -> list[Camera]:
+        """The views' cameras.
+
+        Raises:
+            CaptureError: A value is out of range.
+        """
+        center = (0.0, 0.0, 0.0)
+        try:
+            if self.orbit == "fibonacci":
+                return fibonacci_orbit(self.views, center, self.radius, self.fov_y, self.width, self.height)
+            if self.orbit == "random":
+                return random_orbit(self.views, center, self.radius, self.fov_y, self.width, self.height, self.seed)
+        except CameraError as error:
+            raise CaptureError(f"The views cannot be placed: {error}") from None
+        raise CaptureError(f"The orbit is '{self.orbit}'; it must be fibonacci or random.")
+
+    def _test_mask(self) -> torch.Tensor:
+        if self.test_every == 0:
+            return torch.zeros(max(self.views, 0), dtype=torch.bool)
+        if self.test_every < 2 or not 0 <= self.test_offset < self.test_every:
+            raise CaptureError(
+                f"Every {self.test_every}th view from {self.test_offset} cannot be held out; test_every must be 0 or "
+                "at least 2, and test_offset at least 0 and less than test_every."
+            )
+        return torch.arange(max(self.views, 0)) % self.test_every == self.test_offset
+
+
+@contextmanager
+def _packaged(name: str) -> Iterator[Path]:
+    with resources.as_file(resources.files("difftetvr") / "data" / name) as path:
+        yield path

@@ -1,0 +1,9 @@
+"""From images to a tetrahedral volume: what is optimised, how, and for how long?
+
+The loop, its losses and the steps of vertices stand here; inner rooms hold what a run begins with (`beginning`), how
+its mesh refines itself (`refinement`) and what it leaves (`records`).
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

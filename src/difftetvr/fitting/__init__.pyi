@@ -1,0 +1,71 @@
+from . import beginning as beginning
+from . import config as config
+from . import interrupt as interrupt
+from . import loop as loop
+from . import losses as losses
+from . import metrics as metrics
+from . import motion as motion
+from . import options as options
+from . import parameters as parameters
+from . import positions as positions
+from . import records as records
+from . import refinement as refinement
+from . import regularizers as regularizers
+from . import trainer as trainer
+from .config import FitConfig as FitConfig
+from .loop import fit as fit
+from .motion import Motion as Motion
+from .motion import VertexOptimizerConfig as VertexOptimizerConfig
+from .positions import StepReport as StepReport
+from .positions import VertexOptimizer as VertexOptimizer
+from .records.evaluation import Evaluation as Evaluation
+from .records.evaluation import evaluate as evaluate
+from .records.progress import ProgressDisplay as ProgressDisplay
+from .records.result import FitResult as FitResult
+from .records.result import Progress as Progress
+from .refinement.exchange import Exchange as Exchange
+from .refinement.exchange import Grow as Grow
+from .refinement.star import Star as Star
+from .refinement.strategy import Moment as Moment
+from .refinement.strategy import Refinement as Refinement
+from .refinement.strategy import Situation as Situation
+from .refinement.strategy import Strategy as Strategy
+from .regularizers import shape_barrier as shape_barrier
+from .regularizers import softplus_regularizer as softplus_regularizer
+
+__all__ = [
+    "Evaluation",
+    "Exchange",
+    "FitConfig",
+    "FitResult",
+    "Grow",
+    "Moment",
+    "Motion",
+    "Progress",
+    "ProgressDisplay",
+    "Refinement",
+    "Situation",
+    "Star",
+    "StepReport",
+    "Strategy",
+    "VertexOptimizer",
+    "VertexOptimizerConfig",
+    "beginning",
+    "config",
+    "evaluate",
+    "fit",
+    "interrupt",
+    "loop",
+    "losses",
+    "metrics",
+    "motion",
+    "options",
+    "parameters",
+    "positions",
+    "records",
+    "refinement",
+    "regularizers",
+    "shape_barrier",
+    "softplus_regularizer",
+    "trainer",
+]

@@ -1,0 +1,74 @@
+"""What a reconstruction needs: images that allow what the options ask for, and a device that can do it."""
+
+from __future__ import annotations
+
+import torch
+
+from difftetvr.backend import default_device, get_backend
+from difftetvr.capture.capture import Capture
+from difftetvr.errors import CaptureError, FitError
+from difftetvr.fitting.config import FitConfig
+from difftetvr.fitting.metrics import SSIM_WINDOW
+from difftetvr.fitting.refinement import Strategy
+
+_WITHOUT_DOUBLES = ("mps",)
+
+
+def require_fittable(capture: Capture, config: FitConfig, strategy: Strategy | None) -> None:
+    """Checks what can be known before the first iteration.
+
+    Raises:
+        CaptureError: The images have no alpha but the background needs it, or are too small for the loss.
+        FitError: The device does not exist or cannot move vertices, or a strategy would refine a field on cells.
+        BackendError: No back end works, or the device has none.
+    """
+    if strategy is not None and config.location == "cell":
+        raise FitError("A field on cells cannot be refined; put it on vertices (location vertex), or do not refine.")
+    height, width = capture.images.shape[1:3]
+    if config.loss == "l1-ssim" and min(height, width) < SSIM_WINDOW:
+        raise CaptureError(
+            f"The images of '{capture.name}' have {width} x {height} pixels, fewer than the {SSIM_WINDOW} that SSIM "
+            "compares at a time; use the loss l2 or l1."
+        )
+    if config.needs_alpha and capture.alphas is None:
+        raise CaptureError(
+            f"The images of '{capture.name}' have no alpha, which the background {config.background} needs; "
+            "use background black."
+        )
+    device = device_for(config, strategy)
+    if device.type in _WITHOUT_DOUBLES and _changes_meshes(config, strategy):
+        raise FitError(
+            f"Vertices move and meshes change in double precision, which {device.type} lacks; use the device cpu, or "
+            "neither move nor refine (--no-move --refine none)."
+        )
+
+
+def _changes_meshes(config: FitConfig, strategy: Strategy | None) -> bool:
+    return config.move or strategy is not None
+
+
+def device_for(config: FitConfig, strategy: Strategy | None) -> torch.device:
+    """The device that the options name; by default the best one that can do what they ask for."""
+    device = resolve_device(config.device)
+    if config.device is None and device.type in _WITHOUT_DOUBLES and _changes_meshes(config, strategy):
+        return resolve_device("cpu")
+    return device
+
+
+def resolve_device(name: str | None) -> torch.device:
+    """The device of that name, the best that works for None.
+
+    Raises:
+        FitError: There is no such device here.
+        BackendError: It has no back end, or its back end does not work.
+    """
+    if name is None:
+        return default_device()
+    try:
+        device = torch.device(name)
+        torch.empty(1, device=device)
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        reason = str(error).splitlines()[0].rstrip(".")
+        raise FitError(f"The device '{name}' cannot be used ({reason}); use cpu, cuda or mps.") from error
+    get_backend(name)
+    return device

@@ -1,0 +1,156 @@
+"""The optimisation loop: from images to colours, densities and vertices of a mesh that refines itself."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import torch
+
+from difftetvr.capture.capture import Capture
+from difftetvr.fitting.config import FitConfig
+from difftetvr.fitting.interrupt import InterruptFlag
+from difftetvr.fitting.records.checkpoint import Checkpoint, require_no_folder
+from difftetvr.fitting.records.evaluation import evaluate
+from difftetvr.fitting.records.result import FitResult, Progress
+from difftetvr.fitting.refinement import Strategy
+from difftetvr.fitting.trainer import Trainer
+from difftetvr.mesh.tetmesh import TetMesh
+
+
+def fit(
+    capture: Capture,
+    config: FitConfig | None = None,
+    *,
+    mesh: TetMesh | None = None,
+    strategy: Strategy | None = None,
+    checkpoint: str | Path | None = None,
+    resume: bool = False,
+    on_progress: Callable[[Progress], None] | None = None,
+) -> FitResult:
+    """Optimises colours, densities and vertices of a tetrahedral mesh so that its renderings match images.
+
+    The same capture, options and machine give the same result, also when the run was killed in between and resumed.
+
+    Args:
+        capture: Cameras and images; those of ``capture.test`` are never trained on.
+        config: Options; default: those of the Tooth benchmark.
+        mesh: Mesh to begin with; default: that of ``config``, a file or one made for the capture.
+        strategy: How the mesh is refined, for strategies of your own; default: as ``config.refine`` says.
+        checkpoint: File to save the state to before the first iteration, every ``config.checkpoint_seconds``, after the
+            last one, and when interrupted by SIGINT or SIGTERM.
+        resume: Go on from ``checkpoint`` if it exists; ``mesh`` is then the checkpoint's.
+        on_progress: Called after every iteration.
+
+    Returns:
+        The mesh, its field and the metrics on the held-out views.
+
+    Raises:
+        CaptureError: The images do not allow what the options ask for.
+        FitError: The checkpoint cannot be read, written, or is of another run, the initial mesh does not suit the
+            options or the images, or the loss is not finite.
+        MeshError: The file of the initial mesh cannot be read or holds an invalid mesh, or the grid is too large.
+        KeyboardInterrupt: The run was interrupted; the checkpoint is saved.
+    """
+    path = Path(checkpoint) if checkpoint is not None else None
+    trainer = prepare(
+        capture, config or FitConfig(), mesh=mesh, strategy=strategy, resume_from=path if resume else None
+    )
+    return optimise(trainer, path, on_progress)
+
+
+def prepare(
+    capture: Capture,
+    config: FitConfig,
+    *,
+    mesh: TetMesh | None = None,
+    strategy: Strategy | None = None,
+    resume_from: Path | None = None,
+) -> Trainer:
+    """The first half of :func:`fit`: everything that can fail before the first iteration, without writing anything.
+
+    Args:
+        capture: Cameras and images.
+        config: Options.
+        mesh: Mesh to begin with; default: that of ``config``, a file or one made for the capture.
+        strategy: How the mesh is refined; default: as ``config.refine`` says.
+        resume_from: Checkpoint to go on from if it exists.
+
+    Raises:
+        CaptureError: The images do not allow what the options ask for.
+        FitError: The checkpoint cannot be read or is of another run, the device does not exist, or the initial mesh
+            does not suit the options or the images.
+        MeshError: The file of the initial mesh cannot be read or holds an invalid mesh, or the grid is too large.
+        BackendError: The device has no back end.
+    """
+    if resume_from is not None and resume_from.exists():
+        return Trainer.resume(capture, config, Checkpoint.load(resume_from), strategy)
+    return Trainer(capture, config, mesh, strategy)
+
+
+def optimise(
+    trainer: Trainer, path: Path | None = None, on_progress: Callable[[Progress], None] | None = None
+) -> FitResult:
+    """The second half of :func:`fit`: iterates to the end and evaluates.
+
+    Args:
+        trainer: Where to begin.
+        path: Checkpoint to write.
+        on_progress: Called after every iteration.
+
+    Raises:
+        FitError: The checkpoint cannot be written, or the loss is not finite.
+        KeyboardInterrupt: The run was interrupted; the checkpoint is saved.
+    """
+    capture, config = trainer.capture, trainer.config
+    held_out = capture.test_indices.tolist()
+    with _one_torch_thread():
+        _run(trainer, path, on_progress)
+        field = trainer.parameters.detached_field()
+        evaluation = evaluate(trainer.mesh, field, capture, held_out, config.evaluation_background())
+    return FitResult(trainer.mesh, field, evaluation, trainer.history, config)
+
+
+def _run(trainer: Trainer, path: Path | None, on_progress: Callable[[Progress], None] | None) -> None:
+    """Iterates to the end, with glances and checkpoints on the way."""
+    config, history = trainer.config, trainer.history
+    if path is not None and trainer.iteration < config.steps:
+        # A full disk or a forbidden folder is found before the work, not with its result.
+        require_no_folder(path)
+        trainer.checkpoint().save(path)
+    start = time.perf_counter() - history.seconds
+    saved = time.perf_counter()
+    with InterruptFlag(active=path is not None) as interrupt:
+        while trainer.iteration < config.steps and not interrupt.raised:
+            trainer.step()
+            last = trainer.iteration == config.steps
+            if config.evaluate_every and (trainer.iteration % config.evaluate_every == 0 or last):
+                trainer.glance()
+            history.seconds = time.perf_counter() - start
+            if on_progress is not None:
+                on_progress(trainer.progress(history.seconds))
+            due = time.perf_counter() - saved >= config.checkpoint_seconds
+            if path is not None and (due or last):
+                trainer.checkpoint().save(path)
+                saved = time.perf_counter()
+        if interrupt.raised and path is not None:
+            trainer.checkpoint().save(path)
+            raise KeyboardInterrupt
+
+
+@contextmanager
+def _one_torch_thread() -> Iterator[None]:
+    """Leaves the cores to the renderer.
+
+    Torch's share of an iteration is many small operations. With several threads each of them waits for all cores,
+    which the renderer's threads keep busy: on 2 busy cores that made an iteration 12 times longer. One thread also
+    keeps the order of torch's sums.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)

@@ -1,0 +1,199 @@
+"""The quantities that a reconstruction optimises."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+
+from difftetvr.fitting.config import FitConfig
+from difftetvr.mesh.changes.change import MeshChange
+from difftetvr.mesh.field import Field
+from difftetvr.mesh.harmonics import COUNTS
+from difftetvr.mesh.tetmesh import TetMesh
+
+_FIRST, _SECOND = "exp_avg", "exp_avg_sq"  # Adam's names of its moments
+# Gradients of a mean over pixels shrink as cells and pixels do; Adam's usual 1e-8 would drown those of fine meshes.
+_EPSILON = 1e-15
+
+
+class FieldParameters:
+    """Colours and densities on a mesh, directional colours too if wanted, with their Adam optimiser.
+
+    Density is stored in units of the capture's typical density, so that one learning rate fits scenes of any size.
+    After each step the parameters are projected to the valid ranges, colours to [0, 1] and densities to [0, inf), or to
+    0 where nothing can be: unlike under an exponential or softplus, empty space reaches a density of exactly 0.
+
+    Attributes:
+        color: (N, 3) leaf tensor, linear RGB; N vertices or cells.
+        density: (N,) leaf tensor in units of ``density_unit``.
+        harmonics: (N, B, 3) leaf tensor, coefficients of the directional part of the colours; None without it.
+        density_unit: (N,) densities per unit length that parameters of 1 stand for.
+        is_free: (N,) bool, where nothing can be: densities stay 0.
+        location: ``"vertex"`` or ``"cell"``, what the N entries belong to.
+    """
+
+    def __init__(
+        self, mesh: TetMesh, config: FitConfig, density_unit: torch.Tensor, initial: Field | None = None
+    ) -> None:
+        """Values before the first step.
+
+        Args:
+            mesh: What they are values on.
+            config: Options, chosen for the capture.
+            density_unit: (N,) densities per unit length that parameters of 1 stand for.
+            initial: Field to begin with, at the location of the options; default: the options' initial values.
+        """
+        count = mesh.num_vertices if config.location == "vertex" else mesh.num_cells
+        device = mesh.vertices.device
+        self.location = config.location
+        self.density_unit = density_unit.to(device, torch.float32)
+        self.is_free = torch.zeros(count, dtype=torch.bool, device=device)
+        color = torch.full((count, 3), config.initial_color, device=device)
+        density = torch.full((count,), config.initial_density, device=device)
+        if initial is not None:
+            color.copy_(initial.color.detach())
+            density.copy_(initial.density.detach().double() / self.density_unit)
+        bands = COUNTS[config.harmonics or 0]
+        harmonics = torch.zeros(count, bands, 3, device=device) if bands else None
+        if harmonics is not None and initial is not None and initial.harmonics is not None:
+            shared = min(bands, initial.harmonics.shape[1])
+            harmonics[:, :shared] = initial.harmonics.detach()[:, :shared]
+        self.color, self.density = color.requires_grad_(), density.requires_grad_()
+        self.harmonics = None if harmonics is None else harmonics.requires_grad_()
+        self._shares = [1.0, config.harmonics_rate]
+        groups = [{"params": group} for group in self._groups() if group]
+        self._optimizer = torch.optim.Adam(groups, lr=config.rate, betas=config.betas, eps=_EPSILON, fused=True)
+        # Adam would make its state in the first step; made here, a checkpoint holds the same arrays from the start.
+        for _, parameter in self._items():
+            zeros = torch.zeros_like(parameter, requires_grad=False)
+            self._optimizer.state[parameter] = {
+                "step": torch.zeros((), device=device),
+                _FIRST: zeros,
+                _SECOND: zeros.clone(),
+            }
+
+    def field(self, bands: int) -> Field:
+        """The field that the parameters stand for, differentiable in them.
+
+        Args:
+            bands: Bands of the harmonics that take part.
+        """
+        harmonics = self.harmonics[:, : COUNTS[bands]] if self.harmonics is not None and bands else None
+        return Field(self.color, self.density_unit * self.density, self.location, harmonics)
+
+    def detached_field(self) -> Field:
+        """A copy of the field as it is now, without gradients."""
+        color, density = self.color.detach().clone(), self.density_unit * self.density.detach()
+        harmonics = None if self.harmonics is None else self.harmonics.detach().clone()
+        return Field(color, density, self.location, harmonics)
+
+    def values(self, unit: float) -> torch.Tensor:
+        """(N, 4) copy of the field: linear RGB, and density in a unit that is the same everywhere.
+
+        Args:
+            unit: Density per unit length that a value of 1 stands for.
+        """
+        density = self.density.detach() * (self.density_unit / unit)
+        return torch.cat((self.color.detach(), density[:, None]), 1)
+
+    def carry(self, change: MeshChange) -> None:
+        """Follows a change of the mesh, for parameters on vertices.
+
+        Kept vertices keep their values and moments. New ones start with interpolated values at rest: first moment 0,
+        second moment the mean of the ends of the edge they lie on. The count of steps goes on for all. None of the new
+        ones is known to be free.
+
+        Args:
+            change: What was done to the mesh.
+        """
+        unit = change.carry(self.density_unit)
+        # Where units differ, densities are what is linear along edges.
+        density = change.carry(self.density_unit * self.density.detach()) / unit
+        self.density_unit = unit
+        self.is_free = self.is_free[change.parents[:, 0].long()] & ~change.is_new
+        for name, parameter in list(self._items()):
+            state = self._optimizer.state.pop(parameter)
+            first = change.carry(state[_FIRST])
+            is_new = change.is_new.view(-1, *[1] * (first.ndim - 1))
+            state[_FIRST] = torch.where(is_new, 0.0, first)
+            state[_SECOND] = change.carry(state[_SECOND])
+            carried = density if name == "density" else change.carry(parameter.detach())
+            carried.requires_grad_()
+            self._optimizer.state[carried] = state
+            setattr(self, name, carried)
+        for group, parameters in zip(self._optimizer.param_groups, self._groups()):
+            group["params"] = parameters
+
+    def keep_free(self, is_free: torch.Tensor) -> None:
+        """Makes the field empty where nothing can be, now and after all further steps.
+
+        Args:
+            is_free: (N,) bool.
+        """
+        self.is_free = is_free
+        self._project()
+
+    def add(self, surplus: torch.Tensor, unit: float) -> None:
+        """Changes the field, and projects it to the valid ranges.
+
+        Args:
+            surplus: (N, 4), in the order of :meth:`values`.
+            unit: Density per unit length that a value of 1 stands for.
+        """
+        with torch.no_grad():
+            self.color += surplus[:, :3]
+            self.density += surplus[:, 3] * (unit / self.density_unit)
+        self._project()
+
+    def zero_grad(self) -> None:
+        """Forgets the gradients before the views of a step are accumulated."""
+        self._optimizer.zero_grad(set_to_none=True)
+
+    def step(self, rate: float, haze_penalty: float) -> None:
+        """One projected Adam step with the accumulated gradients.
+
+        Args:
+            rate: Learning rate.
+            haze_penalty: This many mean absolute density gradients are added to every density gradient. Where images
+                say something they drown it; fog that no image can tell from the background decays.
+        """
+        for group, share in zip(self._optimizer.param_groups, self._shares):
+            group["lr"] = share * rate
+        if haze_penalty and self.density.grad is not None:
+            self.density.grad += haze_penalty * self.density.grad.abs().mean()
+        self._optimizer.step()
+        self._project()
+
+    def state(self) -> dict[str, torch.Tensor]:
+        """Parameters and optimiser state by name: all that the next step depends on."""
+        tensors = {**dict(self._items()), "density_unit": self.density_unit, "is_free": self.is_free}
+        for name, parameter in self._items():
+            for key, value in self._optimizer.state[parameter].items():
+                tensors[f"{name}.{key}"] = value
+        return tensors
+
+    def restore(self, tensors: dict[str, torch.Tensor]) -> None:
+        """The inverse of :meth:`state`.
+
+        Args:
+            tensors: Of the names, shapes and types of :meth:`state`; others are ignored.
+        """
+        with torch.no_grad():
+            for name, tensor in self.state().items():
+                tensor.copy_(tensors[name])
+
+    def _project(self) -> None:
+        with torch.no_grad():
+            self.color.clamp_(0.0, 1.0)
+            self.density.clamp_(min=0.0).masked_fill_(self.is_free, 0.0)
+
+    def _groups(self) -> list[list[torch.Tensor]]:
+        """Parameters that share a learning rate."""
+        return [[self.color, self.density], [] if self.harmonics is None else [self.harmonics]]
+
+    def _items(self) -> Iterator[tuple[str, torch.Tensor]]:
+        yield "color", self.color
+        yield "density", self.density
+        if self.harmonics is not None:
+            yield "harmonics", self.harmonics

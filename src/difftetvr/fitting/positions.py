@@ -1,0 +1,198 @@
+"""Steps of vertex positions that never leave a valid mesh, as an object for anyone's own loop."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from difftetvr.errors import FitError
+from difftetvr.fitting.motion import VertexOptimizerConfig
+from difftetvr.mesh.boundary import BoundaryConstraint
+from difftetvr.mesh.changes.change import MeshChange
+from difftetvr.mesh.motion import cap_move, guard_move
+from difftetvr.mesh.shapes import VertexShapes, measure_vertices
+from difftetvr.mesh.tetmesh import TetMesh
+
+_WALL_START = 2.5
+"""Where the wall begins, in units of the guard's floor of Q."""
+_WALL_STEEPNESS = 100.0
+"""Bounds the wall: its weight is this where a cell lies at the floor or under it; the cap takes care of the rest."""
+
+_CONSTRAINT = ("vertices", "tangents", "anchors")
+
+
+@dataclass(frozen=True)
+class StepReport:
+    """What became of the steps of one call.
+
+    Attributes:
+        moved: Vertices that are elsewhere now.
+        capped: Vertices whose step was longer than the cap.
+        halved: Vertices whose move the guard shortened.
+        refused: Vertices whose move the guard refused.
+    """
+
+    moved: int
+    capped: int
+    halved: int
+    refused: int
+
+
+class VertexOptimizer:
+    """Adam for vertex positions that knows the mesh.
+
+    A step goes against the mean gradient, in units of the altitude h of each vertex, plus a shape barrier:
+
+        move = -rate * h * m / sqrt(v) - rate * h^2 * gradient of the sum of -w log Q,   w fixed
+        w = barrier + wall * max(2.5 floor - Q, 0) / (Q - floor),   floor = the least Q that the guard allows
+
+    with m and v the first and second moments of h * gradient, v one number for each vertex: that of the vector's
+    squared length. So the step does not depend on the unit of length, of the loss or on the axes. It is then
+    confined to the boundary, capped and guarded: no cell ever inverts or falls under the floors of the options.
+
+        positions = VertexOptimizer(mesh)
+        for iteration in range(n):
+            loss(render(positions.mesh, field, camera)).backward()     # as many views as you like
+            report = positions.step(positions.config.rate_at(iteration / n))
+
+    Attributes:
+        mesh: The mesh as it is now; its vertices require grad. Every step and every change of the mesh makes a new one,
+            so ask for it anew after each.
+        config: Options.
+        steps: Steps taken so far.
+    """
+
+    def __init__(self, mesh: TetMesh, config: VertexOptimizerConfig | None = None) -> None:
+        """Starts with a copy of the vertices of a mesh.
+
+        Args:
+            mesh: Valid mesh, float32 or float64.
+            config: Options; default: those of the Tooth benchmark.
+        """
+        self.config = config or VertexOptimizerConfig()
+        self.steps = 0
+        self._first = mesh.vertices.new_zeros((mesh.num_vertices, 3), dtype=torch.float64).detach()
+        self._second = self._first[:, 0].clone()
+        self.mesh, self._constraint = self._adopted(mesh)
+
+    def zero_grad(self) -> None:
+        """Forgets the gradients accumulated since the last step."""
+        self.mesh.vertices.grad = None
+
+    def step(self, rate: float | None = None) -> StepReport:
+        """Moves the vertices by the gradients accumulated since the last step, and forgets those.
+
+        Args:
+            rate: Length of the step in altitudes; default: the options' first.
+
+        Returns:
+            How many vertices moved, and how many as they wanted.
+
+        Raises:
+            FitError: There is no gradient, or it is not finite; nothing has changed then.
+        """
+        rate = self.config.rate if rate is None else rate
+        gradient = self._finite_gradient()
+        old = self.mesh.vertices.detach()
+        shapes = measure_vertices(self.mesh, self._barrier_weight)
+        move = self._proposal(gradient, shapes, rate)
+        move, capped = cap_move(self._constraint.apply(old, move), shapes.altitudes, self.config.cap)
+        guarded = guard_move(self.mesh, move, self.config.limits, shapes.cells)
+        self.mesh = self.mesh.with_vertices(guarded.vertices.requires_grad_())
+        moved = int((guarded.vertices.detach() != old).any(1).sum())
+        return StepReport(moved, capped, guarded.halved, guarded.refused)
+
+    def carry(self, change: MeshChange) -> None:
+        """Follows a change of the mesh's cells; gradients accumulated since the last step are forgotten.
+
+        New vertices start at rest: first moment 0, second moment the mean of the ends of the edge they lie on.
+
+        Args:
+            change: What was done to `mesh`.
+        """
+        first = change.carry(self._first)
+        self._first = torch.where(change.is_new[:, None], 0.0, first)
+        self._second = change.carry(self._second)
+        self.mesh, self._constraint = self._adopted(change.mesh)
+
+    def state(self) -> dict[str, torch.Tensor]:
+        """All that the next step depends on besides the cells, by name; gradients gathered for it included."""
+        gradient = self.mesh.vertices.grad
+        return {
+            "vertices": self.mesh.vertices.detach(),
+            "gradient": torch.zeros_like(self.mesh.vertices.detach()) if gradient is None else gradient,
+            "first_moment": self._first,
+            "second_moment": self._second,
+            "steps": torch.tensor(self.steps),
+            **{f"boundary.{name}": getattr(self._constraint, name) for name in _CONSTRAINT},
+        }
+
+    def restore(self, tensors: dict[str, torch.Tensor]) -> None:
+        """The inverse of :meth:`state`, to the bit, for an optimiser of a mesh with the same cells.
+
+        Args:
+            tensors: What :meth:`state` returned; copied.
+
+        Raises:
+            FitError: The tensors are missing or are those of another mesh.
+        """
+        try:
+            copies = {name: tensors[name].detach().to(self.mesh.vertices.device, copy=True) for name in self.state()}
+        except KeyError as error:
+            raise FitError(f"The state of the vertices lacks {error}; pass what state() returned.") from error
+        count = self.mesh.num_vertices
+        if not copies["vertices"].shape == copies["gradient"].shape == (count, 3) or copies["second_moment"].shape != (
+            count,
+        ):
+            raise FitError(
+                f"The saved state has {len(copies['vertices'])} vertices, this mesh has {count}; "
+                "restore it on the mesh that it was saved with."
+            )
+        self.mesh = self.mesh.with_vertices(copies["vertices"].requires_grad_())
+        if copies["gradient"].any():
+            self.mesh.vertices.grad = copies["gradient"]
+        self._first, self._second = copies["first_moment"], copies["second_moment"]
+        self.steps = int(copies["steps"])
+        self._constraint = BoundaryConstraint(*(copies[f"boundary.{name}"] for name in _CONSTRAINT))
+
+    def _adopted(self, mesh: TetMesh) -> tuple[TetMesh, BoundaryConstraint]:
+        """A copy of the mesh for gradients to gather in, and where its boundary may go."""
+        copy = mesh.with_vertices(mesh.vertices.detach().clone().requires_grad_())
+        if self.config.boundary == "slide":
+            return copy, BoundaryConstraint.sliding(mesh, self.config.coplanarity)
+        return copy, BoundaryConstraint.fixed(mesh)
+
+    def _finite_gradient(self) -> torch.Tensor:
+        """(V, 3) float64."""
+        gradient = self.mesh.vertices.grad
+        if gradient is None:
+            raise FitError("No gradient has reached the vertices; call backward() on a rendering of optimizer.mesh.")
+        finite = torch.isfinite(gradient).all(1)
+        if not finite.all():
+            vertex = int(torch.nonzero(~finite)[0, 0])
+            raise FitError(f"The gradient of vertex {vertex} is {gradient[vertex].tolist()}; make the loss finite.")
+        return gradient.double()
+
+    def _proposal(self, gradient: torch.Tensor, shapes: VertexShapes, rate: float) -> torch.Tensor:
+        """(V, 3) float64 moves that loss and barrier ask for; advances the moments."""
+        decay, decay_of_squares = self.config.betas
+        altitudes = shapes.altitudes[:, None]
+        scaled = altitudes * gradient
+        self.steps += 1
+        self._first = torch.lerp(scaled, self._first, decay)
+        self._second = torch.lerp(scaled.square().sum(1), self._second, decay_of_squares)
+        mean = self._first / (1.0 - decay**self.steps)
+        length = (self._second / (1.0 - decay_of_squares**self.steps)).sqrt()[:, None]
+        # Where no gradient has ever been, moments are exactly zero: no epsilon, which would have the loss's unit.
+        move = torch.where(length > 0, -rate * altitudes * mean / length, 0.0)
+        pull = rate * altitudes.square() * shapes.barrier_gradient
+        return move - torch.where(torch.isfinite(pull), pull, 0.0)
+
+    def _barrier_weight(self, quality: torch.Tensor) -> torch.Tensor:
+        """Weight of -log Q of cells of some quality."""
+        floor = self.config.limits.quality
+        start = _WALL_START * floor
+        least = max((start - floor) / _WALL_STEEPNESS, torch.finfo(quality.dtype).tiny)
+        nearness = (start - quality).clamp_min_(0.0) / (quality - floor).clamp_min_(least)
+        return nearness.mul_(self.config.wall).add_(self.config.barrier)

@@ -1,0 +1,120 @@
+"""How well a reconstruction shows views: images, PSNR and SSIM."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from difftetvr.capture.capture import Capture
+from difftetvr.errors import CaptureError
+from difftetvr.fitting.metrics import SSIM_WINDOW, psnr, ssim
+from difftetvr.mesh.field import Field
+from difftetvr.mesh.tetmesh import TetMesh
+from difftetvr.rendering import render
+
+Color = tuple[float, float, float]
+BLACK: Color = (0.0, 0.0, 0.0)
+WHITE: Color = (1.0, 1.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Image quality per view.
+
+    Attributes:
+        views: Indices of the views in the capture.
+        psnr: PSNR in dB of each.
+        ssim: SSIM of each, in which masked pixels are right; empty where the images are smaller than its window of
+            11 x 11 pixels.
+    """
+
+    views: list[int]
+    psnr: list[float]
+    ssim: list[float]
+
+    @property
+    def mean_psnr(self) -> float | None:
+        """Mean over the views of the PSNR in dB; None without views."""
+        return sum(self.psnr) / len(self.psnr) if self.psnr else None
+
+    @property
+    def mean_ssim(self) -> float | None:
+        """Mean over the views of the SSIM; None without values."""
+        return sum(self.ssim) / len(self.ssim) if self.ssim else None
+
+    def to_json(self) -> dict[str, Any]:
+        """Means as ``psnr`` and ``ssim``, and the values of each of ``views``."""
+        return {
+            "psnr": self.mean_psnr,
+            "ssim": self.mean_ssim,
+            "views": self.views,
+            "psnr_per_view": self.psnr,
+            "ssim_per_view": self.ssim,
+        }
+
+
+def usual_background(capture: Capture) -> Color:
+    """What held-out views are compared over by default: white for photographs that alpha cuts out, else black."""
+    return WHITE if capture.encoding == "srgb" and capture.is_cut_out else BLACK
+
+
+def true_image(capture: Capture, view: int, background: Color = BLACK) -> torch.Tensor:
+    """(H, W, 3) image of a view over a background, on the CPU.
+
+    Raises:
+        CaptureError: The background is not black and the capture knows no alpha.
+    """
+    image = capture.images[view]
+    if background == BLACK:
+        return image
+    if capture.alphas is None:
+        raise CaptureError(
+            f"The images of '{capture.name}' have no alpha, so they cannot be put over the background {background}; "
+            "use a black background."
+        )
+    return image + (1.0 - capture.alphas[view])[..., None] * torch.tensor(background)
+
+
+def where_valid(capture: Capture, view: int, image: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
+    """An image of a view with the truth in the pixels that the capture's mask leaves out."""
+    if capture.valid is None:
+        return image
+    return torch.where(capture.valid[view].to(image.device)[..., None], image, truth)
+
+
+def valid_share(capture: Capture, view: int) -> float:
+    """Share of a view's pixels that the capture's mask does not leave out."""
+    return 1.0 if capture.valid is None else float(capture.valid[view].float().mean())
+
+
+@torch.no_grad()
+def rendered_image(mesh: TetMesh, field: Field, capture: Capture, view: int, background: Color = BLACK) -> torch.Tensor:
+    """(H, W, 3) image of the reconstruction from the camera of a view, on the CPU."""
+    behind = torch.tensor(background, device=mesh.vertices.device)
+    return render(mesh, field, capture.cameras[view], background=behind).color.cpu()
+
+
+def evaluate(
+    mesh: TetMesh, field: Field, capture: Capture, views: Sequence[int], background: Color = BLACK
+) -> Evaluation:
+    """Renders views and compares them with the truth.
+
+    Args:
+        mesh: The reconstruction's mesh, on any device.
+        field: Its colours and densities.
+        capture: Cameras and true images.
+        views: Indices of the views to compare; those without any valid pixel are left out.
+        background: Linear RGB behind the volume.
+    """
+    psnrs, ssims = [], []
+    views = [view for view in views if valid_share(capture, view) > 0.0]
+    for view in views:
+        truth = true_image(capture, view, background)
+        image = where_valid(capture, view, rendered_image(mesh, field, capture, view, background), truth)
+        psnrs.append(psnr(image, truth, valid_share(capture, view)))
+        if min(truth.shape[:2]) >= SSIM_WINDOW:
+            ssims.append(ssim(image, truth))
+    return Evaluation(views, psnrs, ssims)

@@ -1,0 +1,150 @@
+"""The output folder of a reconstruction: which run it holds, and whether another may go there."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from difftetvr.errors import FitError
+from difftetvr.files import atomic_write, require_writable_folder
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """Names of what a reconstruction leaves in its folder.
+
+    Attributes:
+        path: The folder.
+    """
+
+    path: Path
+
+    @property
+    def config(self) -> Path:
+        """Options of the run, JSON."""
+        return self.path / "config.json"
+
+    @property
+    def checkpoint(self) -> Path:
+        """State to resume from, safetensors."""
+        return self.path / "checkpoint.safetensors"
+
+    @property
+    def model(self) -> Path:
+        """The resulting mesh and field."""
+        return self.path / "model.vtu"
+
+    @property
+    def metrics(self) -> Path:
+        """Numbers of the result, JSON; written last."""
+        return self.path / "metrics.json"
+
+    @property
+    def curves(self) -> Path:
+        """Plot of loss and PSNR."""
+        return self.path / "curves.png"
+
+    @property
+    def comparison(self) -> Path:
+        """A few held-out views: truth, reconstruction and difference side by side."""
+        return self.path / "comparison.png"
+
+    @property
+    def cut(self) -> Path:
+        """A cut through the mesh: what it holds, and where its cells are."""
+        return self.path / "cut.png"
+
+    @property
+    def views(self) -> Path:
+        """Folder of single pictures of held-out views."""
+        return self.path / "views"
+
+    def holds_run(self) -> bool:
+        """Whether a run has written into the folder."""
+        return any(p.exists() for p in (self.config, self.checkpoint, self.model, self.metrics))
+
+    def require_free(self, *, resume: bool, overwrite: bool) -> None:
+        """Checks that a run may go into the folder; changes nothing.
+
+        Args:
+            resume: The run in the folder will be continued.
+            overwrite: The run in the folder will be replaced.
+
+        Raises:
+            FitError: The folder holds a run and neither is set, both are, it is a file, or nothing can be created
+                in it.
+        """
+        if resume and overwrite:
+            raise FitError("--resume and --overwrite contradict each other; give one of them.")
+        if self.holds_run() and not resume and not overwrite:
+            raise FitError(
+                f"{self.path} already holds a run; continue it with --resume, replace it with --overwrite, or choose "
+                "another folder."
+            )
+        if self.path.exists() and not self.path.is_dir():
+            raise FitError(f"{self.path} is a file, so no folder can have this name; choose another.")
+        require_writable_folder(self.path, FitError)
+
+    @contextmanager
+    def occupied(self, options: dict[str, Any], *, overwrite: bool, begun: Callable[[], bool]) -> Iterator[None]:
+        """Context manager for a run in the folder: creates it where there is none, and writes the options.
+
+        When the body raises an error before a new run has begun, everything that this call or the body left is taken
+        back, so that the next attempt finds the folder free.
+
+        Args:
+            options: Of the run, as JSON values.
+            overwrite: Remove the files of a run in it first; others are left alone.
+            begun: Whether the run has got anywhere that is worth keeping.
+
+        Raises:
+            FitError: The folder cannot be created or emptied, or the options cannot be written.
+        """
+        is_new = overwrite or not self.holds_run()
+        absent = [p for p in (self.path, *self.path.parents) if not p.exists()]
+        try:
+            try:
+                self.path.mkdir(parents=True, exist_ok=True)
+                if overwrite:
+                    self._clear()
+            except OSError as error:
+                raise FitError(f"The folder {self.path} cannot be used ({error.strerror}); choose another.") from error
+            write_json(self.config, options)
+            yield
+        except Exception:
+            if is_new and not begun():
+                self._withdraw(absent)
+            raise
+
+    def _clear(self) -> None:
+        # The checkpoint goes first and the options last: cut short, this never leaves a state to resume from without
+        # the options that it belongs to.
+        for path in (self.checkpoint, self.model, self.metrics, self.curves, self.comparison, self.cut):
+            path.unlink(missing_ok=True)
+        for pattern in ("*_truth.png", "*_reconstruction.png"):
+            for picture in self.views.glob(pattern):
+                picture.unlink()
+        self.config.unlink(missing_ok=True)
+
+    def _withdraw(self, folders: list[Path]) -> None:
+        """Removes the start of a run, and those of the given folders, innermost first, that are empty then."""
+        with contextlib.suppress(OSError):
+            self.checkpoint.unlink(missing_ok=True)
+            self.config.unlink(missing_ok=True)
+            for folder in folders:
+                folder.rmdir()
+
+
+def write_json(path: Path, values: dict[str, Any]) -> None:
+    """Writes JSON, whole or not at all.
+
+    Raises:
+        FitError: The file cannot be written.
+    """
+    with atomic_write(path, FitError) as temporary:
+        temporary.write_text(json.dumps(values, indent=2) + "\n")

@@ -1,0 +1,162 @@
+"""One round of `Exchange`: flips, collapses and bisections, chosen by what they are predicted to win."""
+
+from __future__ import annotations
+
+import torch
+
+from difftetvr.fitting.refinement.exchange import Exchange
+from difftetvr.fitting.refinement.gains import (
+    CollapseCosts,
+    bisection_gains,
+    collapse_costs,
+    edges_before,
+    flip_gains,
+)
+from difftetvr.fitting.refinement.strategy import Refinement, Situation
+from difftetvr.mesh.arrays import true_indices
+from difftetvr.mesh.boundary import removable_vertices
+from difftetvr.mesh.changes.bisection import bisect_edges, independent_edges, long_edges
+from difftetvr.mesh.changes.change import MeshChange
+from difftetvr.mesh.changes.collapse import collapse_edges
+from difftetvr.mesh.changes.flip_search import find_flips
+from difftetvr.mesh.changes.flips import THREE_TO_TWO, TWO_TO_THREE, apply_flips, independent_flips
+from difftetvr.mesh.tetmesh import TetMesh
+from difftetvr.mesh.topology.incidence import cell_edges, cells_per_edge, find_edges
+from difftetvr.rendering.gauss_newton import ImageModel
+
+_LOOKED_AT = 5.0
+"""Vertices whose collapse is priced, in units of those that may vanish."""
+
+
+def exchange_cells(situation: Situation, target: int, options: Exchange) -> Refinement | None:
+    """Changes of the mesh that together leave at most ``target`` cells, None if there is nothing to gain.
+
+    Args:
+        situation: What to decide upon.
+        target: Cells afterwards.
+        options: How much of what.
+    """
+    model = situation.model()
+    exchange = _Round(situation, model, options)
+    if options.flips:
+        exchange.flip(model, target, options)
+    if options.share:
+        exchange.collapse(model, options)
+    exchange.bisect(target, options)
+    return exchange.refinement()
+
+
+class _Round:
+    """The mesh so far, and what is known about its edges."""
+
+    def __init__(self, situation: Situation, model: ImageModel, options: Exchange) -> None:
+        self.mesh = situation.mesh
+        self.values = situation.values.to(model.edges.gradient.dtype)
+        middles = self.mesh.vertices[self.mesh.topology.edges.long()].mean(1)
+        is_free = situation.free_space.contains(middles)
+        self.gains = bisection_gains(self.mesh, self.values, model.edges, is_free, options.start)
+        self.surplus: torch.Tensor | None = None
+        self.changes: list[MeshChange] = []
+        self.predicted = 0.0
+        self.flipped = 0
+
+    def flip(self, model: ImageModel, target: int, options: Exchange) -> None:
+        """Cut the same space otherwise where that fits the images better."""
+        flips = find_flips(self.mesh, min_quality=options.min_quality)
+        # A 2-3 flip makes a cell more, a 3-2 flip one less: one that a bisection could use.
+        cells = torch.where(flips.kind == TWO_TO_THREE, 1, torch.where(flips.kind == THREE_TO_TWO, -1, 0))
+        gain = flip_gains(flips, self.values, model) - self._price_of_a_cell(options) * cells
+        worthwhile = true_indices(gain > 0)
+        flips, gain = flips.select(worthwhile), gain[worthwhile]
+        chosen = independent_flips(flips, gain)
+        # What collapses cannot take away again must not be added.
+        room = max(0, target - self.mesh.num_cells) + int(options.share * self.mesh.num_cells)
+        adds = (chosen.kind == TWO_TO_THREE).int()
+        chosen = chosen.select(adds.cumsum(0) * adds <= room)
+        self.flipped = len(chosen)
+        self.predicted += float(flip_gains(chosen, self.values, model).sum())
+        change = apply_flips(chosen)
+        self._carry_edges(change)
+        self._apply(change)
+
+    def collapse(self, model: ImageModel, options: Exchange) -> None:
+        """Take the cheapest cells away."""
+        share = min(1.0, _LOOKED_AT * options.share)
+        removable = removable_vertices(self.mesh, slide=options.boundary == "slide")
+        costs = collapse_costs(self.mesh, self.values, model.vertices, removable, share)
+        change = collapse_edges(
+            self.mesh,
+            costs.edges,
+            costs.target,
+            costs.cost / costs.cells,
+            limit=int(options.share * self.mesh.num_cells),
+            min_quality=options.min_quality,
+            boundary=options.boundary,
+        )
+        self.predicted -= _cost_of(costs, self.mesh, change)
+        self._carry_edges(change)
+        self._apply(change)
+
+    def bisect(self, target: int, options: Exchange) -> None:
+        """Bisect the most promising edges until there are as many cells as wanted."""
+        topology = self.mesh.topology
+        ends = topology.edges.long()
+        positions = self.mesh.vertices
+        length = torch.linalg.vector_norm(positions[ends[:, 1]] - positions[ends[:, 0]], dim=1)
+        gain = self.gains.gain
+        allowed = long_edges(self.mesh, options.long) & (gain > 0)
+        budget = max(0, target - self.mesh.num_cells)
+        # Gain per new cell; long edges come first, which keeps shapes good.
+        chosen = independent_edges(self.mesh, gain / cells_per_edge(topology) * length, allowed, budget)
+        change = bisect_edges(self.mesh, chosen)
+        done = find_edges(topology, change.parents[change.is_new].long())
+        self.surplus = torch.zeros_like(change.carry(self.values))
+        self.surplus[change.is_new] = self.gains.start[done]
+        self.predicted += float(self.gains.start_gain[done].sum())
+        self._apply(change)
+
+    def refinement(self) -> Refinement | None:
+        """What came of it."""
+        refinement = Refinement(self.changes, self.surplus, self.flipped, self.predicted)
+        return refinement if self.flipped + refinement.removed + refinement.added else None
+
+    def _price_of_a_cell(self, options: Exchange) -> float:
+        """Gain per new cell of the last bisection among the best that one round can pay for."""
+        cells = cells_per_edge(self.mesh.topology)
+        gain, order = (self.gains.gain / cells).sort(descending=True)
+        affordable = cells[order].cumsum(0) <= max(1.0, options.share * self.mesh.num_cells)
+        return float(gain[max(0, int(affordable.sum()) - 1)])
+
+    def _apply(self, change: MeshChange) -> None:
+        self.changes.append(change)
+        self.values = change.carry(self.values)
+        self.mesh = change.mesh
+
+    def _carry_edges(self, change: MeshChange) -> None:
+        """What was predicted for an edge holds while its cells are the same."""
+        before = edges_before(self.mesh.topology, change)
+        before[cell_edges(change.mesh.topology)[_changed_cells(self.mesh, change)].view(-1).long()] = -1
+        self.gains = self.gains.at(before)
+
+
+def _changed_cells(mesh: TetMesh, change: MeshChange) -> torch.Tensor:
+    """Cells after a change that adds no vertices which have other corners than before."""
+    before = mesh.tets[change.cell_parents.long()]
+    after = change.parents[:, 0][change.mesh.tets.long()]
+    return true_indices((before != after).any(1))
+
+
+def _cost_of(costs: CollapseCosts, mesh: TetMesh, change: MeshChange) -> float:
+    """Sum of the predicted costs of the collapses that a change has made."""
+    cells = _changed_cells(mesh, change)
+    before = mesh.tets[change.cell_parents[cells].long()].long()
+    after = change.parents[:, 0][change.mesh.tets[cells].long()].long()
+    moved = before != after
+    pairs = torch.unique(torch.stack((before[moved], after[moved]), 1), dim=0)
+    kept = pairs[:, 1]
+    edges = find_edges(mesh.topology, pairs)
+    by_half_edge = torch.full(
+        (2 * mesh.topology.edges.shape[0],), torch.nan, dtype=costs.cost.dtype, device=kept.device
+    )
+    by_half_edge[2 * costs.edges + costs.target] = costs.cost
+    return float(by_half_edge[2 * edges + (mesh.topology.edges[edges, 1] == kept)].sum())

@@ -1,0 +1,219 @@
+"""What changes of the mesh would do to the squared error of its images, predicted one by one.
+
+Everywhere, values are (V, 4) parameters of the vertices: linear RGB in [0, 1] and density >= 0, in the unit that the
+derivatives are for.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from difftetvr.mesh.arrays import chunks, true_indices
+from difftetvr.mesh.changes.change import MeshChange
+from difftetvr.mesh.changes.flips import FOUR_TO_FOUR, TWO_TO_THREE, Flips
+from difftetvr.mesh.tetmesh import TetMesh
+from difftetvr.mesh.topology.incidence import cell_faces, cells_per_edge, find_edges, stars
+from difftetvr.mesh.topology.topology import Topology
+from difftetvr.rendering.gauss_newton import HatDerivatives, ImageModel
+
+_CELLS_OF_VERTEX = 24
+_DAMPING = 0.01
+_ON_A_FACE = 1e-6  # so far outside of a cell, in barycentric coordinates, a point still counts as inside
+
+
+@dataclass(frozen=True)
+class BisectionGains:
+    """What bisecting each edge would win.
+
+    Attributes:
+        gain: (E,) predicted decrease of the error with the best values at the new vertex.
+        start_gain: (E,) the same with the values it starts with.
+        start: (E, 4) these values, minus the mean of the edge's ends.
+    """
+
+    gain: torch.Tensor
+    start_gain: torch.Tensor
+    start: torch.Tensor
+
+    def at(self, edges: torch.Tensor) -> BisectionGains:
+        """The gains of some edges, (N,) indices; nothing is known of -1, which wins nothing."""
+        known = edges >= 0
+        return BisectionGains(
+            torch.where(known, self.gain[edges], 0.0),
+            torch.where(known, self.start_gain[edges], 0.0),
+            self.start[edges],
+        )
+
+
+def bisection_gains(
+    mesh: TetMesh, values: torch.Tensor, edges: HatDerivatives, is_free: torch.Tensor, start: float = 1.0
+) -> BisectionGains:
+    """Predicts what bisecting each edge would win.
+
+    Args:
+        mesh: The mesh.
+        values: (V, 4) parameters.
+        edges: Derivatives by the hats of ``mesh.topology.edges``.
+        is_free: (E,) bool, whose new vertices have to have density 0.
+        start: Part of the best surplus that new vertices start with.
+    """
+    ends = mesh.topology.edges.long()
+    middle = values[ends].mean(1)
+    most = torch.where(is_free, -middle[:, 3], torch.inf)
+    upper = torch.cat((1.0 - middle[:, :3], most[:, None]), 1)
+    best = edges.best_step(-middle, upper, _DAMPING)
+    first = start * best
+    first[:, 3] = torch.where(is_free, most, first[:, 3])
+    return BisectionGains(edges.decrease(best).clamp_min(0.0), edges.decrease(first), first)
+
+
+@dataclass(frozen=True)
+class CollapseCosts:
+    """Candidates for half-edge collapses, and what each of them would cost.
+
+    Attributes:
+        edges: (C,) indices into ``topology.edges``.
+        target: (C,) which end stays, 0 or 1.
+        cost: (C,) predicted increase of the error.
+        cells: (C,) cells that vanish.
+    """
+
+    edges: torch.Tensor
+    target: torch.Tensor
+    cost: torch.Tensor
+    cells: torch.Tensor
+
+
+def collapse_costs(
+    mesh: TetMesh, values: torch.Tensor, vertices: HatDerivatives, removable: torch.Tensor, share: float
+) -> CollapseCosts:
+    """Predicts what merging vertices into their neighbours would cost.
+
+    After a collapse the removed vertex's place has the value that the cells which fill its star interpolate there. The
+    cost is that of giving the vertex this value, and of the bends between these cells. The error's slope is left out:
+    what a collapse would win by it, a better value of the vertex wins as well. Only vertices that are cheap by a first
+    estimate are looked at: the cost of giving them the mean of their neighbours.
+
+    Args:
+        mesh: The mesh.
+        values: (V, 4) parameters.
+        vertices: Derivatives by the vertices' hats.
+        removable: (V,) bool, which vertices may go at all.
+        share: Share of all vertices to look at, in (0, 1].
+    """
+    edges = mesh.topology.edges.long()
+    estimate = vertices.curvature(_neighbour_mean(edges, values) - values)
+    estimate = torch.where(removable, estimate, torch.inf)
+    count = min(int(removable.sum()), max(1, round(share * len(values))))
+    looked_at = torch.zeros(len(values), dtype=torch.bool, device=values.device)
+    looked_at[torch.topk(estimate, count, largest=False).indices] = True
+    candidates = [true_indices(looked_at[edges[:, 1 - target]]) for target in (0, 1)]
+    rows = torch.cat(candidates)
+    target = torch.repeat_interleave(torch.tensor([len(c) for c in candidates], device=rows.device))
+    kept = edges[rows].gather(1, target[:, None])[:, 0]
+    removed = edges[rows].sum(1) - kept
+    cost = torch.empty(len(rows), dtype=values.dtype, device=values.device)
+    for part in chunks(len(rows), rows.device, width=_CELLS_OF_VERTEX):
+        cost[part] = _cost(mesh, values, vertices[removed[part]], removed[part], kept[part])
+    found = true_indices(torch.isfinite(cost))
+    cells = cells_per_edge(mesh.topology)[rows[found]]
+    return CollapseCosts(rows[found], target[found], cost[found], cells)
+
+
+def _neighbour_mean(edges: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+    sums, counts = torch.zeros_like(values), torch.zeros_like(values[:, 0])
+    for one, other in ((0, 1), (1, 0)):
+        sums.index_add_(0, edges[:, one], values[edges[:, other]])
+        counts += torch.bincount(edges[:, one], minlength=len(values))
+    return sums / counts.clamp_min(1.0)[:, None]
+
+
+def _cost(
+    mesh: TetMesh, values: torch.Tensor, hats: HatDerivatives, removed: torch.Tensor, kept: torch.Tensor
+) -> torch.Tensor:
+    """(N,) cost of merging `removed` into `kept`, whose `hats` are those of the removed ones; NaN where impossible."""
+    owner, cells = stars(mesh.topology, removed)
+    tets = mesh.tets[cells].long()
+    rows = true_indices(~(tets == kept[owner, None]).any(1))
+    owner, tets = owner[rows], tets[rows]
+    # A new cell has the face opposite the removed vertex, and the kept one as its apex.
+    corners = torch.cat((tets[tets != removed[owner, None]].view(-1, 3), kept[owner, None]), 1)
+    weights, volume = _barycentric(mesh.vertices.detach().double(), corners, removed[owner])
+    # What each new cell's linear function is at the removed vertex's place; only the one that holds it shows it there.
+    extrapolated = (weights.to(values.dtype)[:, :, None] * values[corners]).sum(1)
+    least = torch.nan_to_num(weights.amin(1), -torch.inf, -torch.inf, -torch.inf)
+    best = torch.full((len(removed),), -torch.inf, dtype=torch.float64, device=values.device)
+    best.scatter_reduce_(0, owner, least, "amax")
+    holds = true_indices((least == best[owner]) & (least > -_ON_A_FACE))
+    after = torch.full((len(removed), 4), torch.nan, dtype=values.dtype, device=values.device)
+    after[owner[holds]] = extrapolated[holds]
+
+    # The old and the new cell at a face overlap down to this share of the way to the apex. There, the other new cells
+    # differ from what the hat explains by how much their functions differ, seen from the removed vertex's place.
+    sides, towards_apex = weights[:, :3], weights[:, 3]
+    reach = 1.0 / (towards_apex + 3.0 * sides.amax(1).clamp_min(0.0)).clamp_min(_ON_A_FACE)
+    deviation = reach.to(values.dtype)[:, None] * (extrapolated - after[owner])
+    bends = hats[owner].curvature(deviation) * volume.to(values.dtype)
+    total = torch.zeros_like(hats.emission).index_add_(0, owner, volume.to(values.dtype))
+    bent = torch.zeros_like(total).index_add_(0, owner, bends) / total
+    return 0.5 * (bent + hats.curvature(after - values[removed]))
+
+
+def _barycentric(
+    positions: torch.Tensor, corners: torch.Tensor, vertices: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Coordinates (N, 4) of vertices (N,) in tetrahedra (N, 4), and the tetrahedra's volumes (N,) times six."""
+    apex = positions[corners[:, 3]]
+    a, b, c = (positions[corners[:, k]] - apex for k in range(3))
+    place = positions[vertices] - apex
+    normals = (torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b))
+    volume = (a * normals[0]).sum(1)
+    weights = torch.stack([(place * normal).sum(1) for normal in normals], 1) / volume[:, None]
+    return torch.cat((weights, 1.0 - weights.sum(1, keepdim=True)), 1), volume.abs()
+
+
+def flip_gains(flips: Flips, values: torch.Tensor, model: ImageModel) -> torch.Tensor:
+    """Predicts what flips would win.
+
+    A flip changes the field by a surplus where what vanishes and what appears cross, falling to 0 at the outer faces of
+    its cells. The gain is that of the hat of the face or edge that vanishes, whose peak is in its centre.
+
+    Args:
+        flips: Flips of the mesh that the model is of.
+        values: (V, 4) parameters.
+        model: Derivatives.
+
+    Returns:
+        (N,) predicted decrease of the error.
+    """
+    topology, surplus = flips.mesh.topology, flips.surplus(values)
+    gain = torch.zeros_like(surplus[:, 0])
+    by_face = true_indices(flips.kind == TWO_TO_THREE)
+    first = flips.cells[by_face, 0].long()
+    corners = topology.tets[first]
+    # The vanishing face lies opposite the end of the new edge that is a corner of the first cell.
+    opposite = (corners[:, :, None] == flips.edge[by_face, None, :]).any(2).int().argmax(1)
+    faces = cell_faces(topology)[first, opposite].long()
+    gain[by_face] = model.faces[faces].decrease(surplus[by_face])
+    by_edge = true_indices(flips.kind != TWO_TO_THREE)
+    is_ring = (flips.kind[by_edge] == FOUR_TO_FOUR)[:, None]
+    ends = torch.where(is_ring, flips.ring[by_edge][:, [0, 2]], flips.edge[by_edge])
+    gain[by_edge] = model.edges[find_edges(topology, ends.long())].decrease(surplus[by_edge])
+    return gain
+
+
+def edges_before(topology: Topology, change: MeshChange) -> torch.Tensor:
+    """Which edges of the mesh before a change those after it are.
+
+    Args:
+        topology: Cells before the change.
+        change: The change.
+
+    Returns:
+        (E',) int64 indices into ``topology.edges`` for each of ``change.mesh.topology.edges``; -1 for new ones.
+    """
+    ends = change.mesh.topology.edges.long()
+    old = change.parents[:, 0].long()[ends]
+    return torch.where(change.is_new[ends].any(1), -1, find_edges(topology, old))

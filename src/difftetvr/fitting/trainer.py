@@ -1,0 +1,348 @@
+"""One reconstruction between two iterations, and what an iteration does."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import astuple
+from functools import reduce
+from operator import add
+from typing import TYPE_CHECKING
+
+import torch
+
+from difftetvr.capture.capture import Capture
+from difftetvr.errors import FitError
+from difftetvr.fitting.beginning.initial_mesh import Start, load_start
+from difftetvr.fitting.beginning.requirements import device_for, require_fittable
+from difftetvr.fitting.beginning.starting_mesh import starting_mesh
+from difftetvr.fitting.config import FitConfig
+from difftetvr.fitting.losses import LOSSES, sparsity
+from difftetvr.fitting.metrics import psnr_of_mse
+from difftetvr.fitting.parameters import FieldParameters
+from difftetvr.fitting.positions import StepReport, VertexOptimizer
+from difftetvr.fitting.records.checkpoint import Checkpoint, describe_capture, require_same_capture
+from difftetvr.fitting.records.evaluation import evaluate, rendered_image, true_image, valid_share, where_valid
+from difftetvr.fitting.records.history import History, MoveTotals, RefinementRecord
+from difftetvr.fitting.records.result import Progress
+from difftetvr.fitting.refinement import Moment, Refinement, Situation, Strategy
+from difftetvr.mesh.tetmesh import TetMesh
+from difftetvr.rendering import render
+from difftetvr.rendering.gauss_newton import ImageModel, model_image
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+_GLANCE_VIEWS = 4
+_LEAST_SHARE = 1e-6  # of the pixels: a view that is masked altogether has no error
+_POSITIONS = "positions."  # prefix of the positions' state in a checkpoint
+
+
+class Trainer:
+    """A reconstruction between two iterations; its state alone decides how it goes on.
+
+    Attributes:
+        capture: Images and cameras.
+        config: Options, those that were left open chosen for the capture.
+        strategy: How the mesh is refined; None: not at all.
+        budget: Cells that the mesh may have.
+        parameters: Colours and densities under optimisation.
+        positions: Vertex positions under optimisation; None where they are fixed.
+        iteration: Iterations done.
+        history: What happened so far.
+        repair: What mending the initial mesh changed, in words; None where it was not mended.
+        starts_from_field: Whether the initial mesh brought colours and densities along.
+    """
+
+    def __init__(
+        self, capture: Capture, config: FitConfig, mesh: TetMesh | None = None, strategy: Strategy | None = None
+    ) -> None:
+        """Prepares the first iteration.
+
+        Args:
+            capture: Images and cameras.
+            config: Options.
+            mesh: Mesh to begin with; default: the file or the starting mesh that the options ask for.
+            strategy: How to refine it; default: as the options say.
+
+        Raises:
+            CaptureError: The background needs alpha that the capture lacks.
+            FitError: The device does not exist or cannot move vertices, a strategy would refine a field on cells, or
+                the initial mesh does not suit the options or the images.
+            MeshError: The file of the initial mesh cannot be read or holds an invalid mesh, or the grid is too large.
+        """
+        config = config.for_capture(capture)
+        strategy = strategy or config.strategy()
+        require_fittable(capture, config, strategy)
+        self.capture = capture
+        self.config = config
+        self.strategy = strategy
+        start = _start(capture, config, strategy, mesh)
+        self.repair = start.repair
+        self.starts_from_field = start.field is not None
+        self._mesh = start.mesh.to(device=device_for(config, strategy))
+        self.positions = VertexOptimizer(self._mesh, config.motion) if config.move else None
+        self.budget = self._budget(mesh is not None or config.grid is not None or config.initial_mesh is not None)
+        units = capture.density_units_at(self._sites())
+        self.parameters = FieldParameters(self._mesh, config, units, start.field)
+        self._free_space = capture.free_space(config.free_space or 0.0)
+        self.parameters.keep_free(self._free_space.contains(self._sites()))
+        self.iteration = 0
+        self.history = History()
+        self._train_views: list[int] = capture.train_indices.tolist()
+        self._capture_description = describe_capture(capture)
+
+    @property
+    def mesh(self) -> TetMesh:
+        """The mesh as it is now, detached."""
+        mesh = self.positions.mesh if self.positions else self._mesh
+        return mesh.with_vertices(mesh.vertices.detach())
+
+    def step(self) -> None:
+        """One iteration: refines the mesh where that is due, renders views, moves parameters and vertices.
+
+        Raises:
+            FitError: The loss is not finite.
+        """
+        self._refine_if_due()
+        rate = self._motion_rate()
+        mesh = self.positions.mesh if self.positions and rate is not None else self.mesh
+        self.parameters.zero_grad()
+        batch = self.config.views_at(self.iteration, len(self._train_views))
+        background = self.config.background_at(self.iteration)
+        losses, errors = [], []
+        for position in batch:
+            loss, error = self._accumulate(mesh, self._train_views[position], background, 1.0 / len(batch))
+            losses.append(loss)
+            errors.append(error)
+        if not all(math.isfinite(loss) for loss in losses):
+            raise FitError(
+                f"The loss of iteration {self.iteration} is not finite; check the images or lower the learning rate."
+            )
+        self.parameters.step(self.config.rate_at(self.iteration), self.config.haze_penalty)
+        self._move(rate)
+        self.history.loss.append(sum(losses) / len(losses))
+        self.history.psnr.append(psnr_of_mse(sum(errors) / len(errors)))
+        self.iteration += 1
+
+    def glance(self) -> None:
+        """Notes the mean PSNR over a few held-out views, for the curves; decides nothing."""
+        tested = self.capture.test_indices.tolist()
+        views = tested[:: max(1, math.ceil(len(tested) / _GLANCE_VIEWS))]
+        seen = evaluate(
+            self.mesh, self.parameters.detached_field(), self.capture, views, self.config.evaluation_background()
+        ).mean_psnr
+        if seen is not None:
+            self.history.evaluations.append((self.iteration, seen))
+
+    def checkpoint(self) -> Checkpoint:
+        """The state, to be saved."""
+        tensors = {"vertices": self.mesh.vertices, "tets": self.mesh.tets, **self.parameters.state()}
+        if self.positions:
+            state = self.positions.state()
+            tensors |= {_POSITIONS + name: tensor for name, tensor in state.items() if name not in tensors}
+        strategy = type(self.strategy).__name__
+        return Checkpoint(
+            self.iteration,
+            self.config,
+            self._capture_description,
+            tensors,
+            self.budget,
+            strategy,
+            self.history,
+            self.repair,
+        )
+
+    @staticmethod
+    def resume(
+        capture: Capture, config: FitConfig, checkpoint: Checkpoint, strategy: Strategy | None = None
+    ) -> Trainer:
+        """Goes on from a checkpoint.
+
+        Raises:
+            FitError: The checkpoint is of a run with other options or images, or lacks something.
+        """
+        checkpoint.config.require_same_run(config.for_capture(capture))
+        trainer = Trainer(capture, config, checkpoint.mesh(), strategy)
+        require_same_capture(checkpoint.capture, trainer._capture_description)
+        checkpoint.require_strategy(type(trainer.strategy).__name__)
+        checkpoint.require_tensors_like(trainer.checkpoint().tensors)
+        trainer.parameters.restore(checkpoint.tensors)
+        if trainer.positions:
+            trainer.positions.restore({k.removeprefix(_POSITIONS): v for k, v in checkpoint.tensors.items()})
+        trainer.budget = checkpoint.budget
+        trainer.iteration = checkpoint.iteration
+        trainer.history = checkpoint.history
+        trainer.repair = checkpoint.repair
+        return trainer
+
+    def progress(self, seconds: float) -> Progress:
+        """A summary for a display; loss and PSNR are means over the last pass through the training views."""
+        window = self._epoch
+        losses, psnrs = self.history.loss[-window:], self.history.psnr[-window:]
+        return Progress(
+            iteration=self.iteration,
+            iterations=self.config.steps,
+            loss=sum(losses) / max(1, len(losses)),
+            train_psnr=sum(psnrs) / max(1, len(psnrs)),
+            held_out_psnr=self.history.evaluations[-1][1] if self.history.evaluations else None,
+            cells=self.mesh.num_cells,
+            moves=self.history.moves,
+            refinements=len(self.history.refinements),
+            last_refinement=self.history.refinements[-1] if self.history.refinements else None,
+            seconds=seconds,
+        )
+
+    @property
+    def _epoch(self) -> int:
+        """Iterations of one pass over the training views."""
+        return max(1, len(self._train_views) // self.config.batch_views)
+
+    def _budget(self, mesh_is_given: bool) -> int:
+        """The options' cells; a given mesh is its own budget, unless the strategy is to make it grow."""
+        budget = self.config.budget
+        if not mesh_is_given:
+            return budget
+        grows = self.strategy is not None and self.strategy.initial_cells(budget) < budget
+        return max(budget if grows else 0, self._mesh.num_cells)
+
+    def _sites(self) -> torch.Tensor:
+        """(N, 3) positions of the vertices, or centres of the cells, that the parameters belong to."""
+        mesh = self.mesh
+        return mesh.vertices if self.config.location == "vertex" else mesh.vertices[mesh.tets.long()].mean(1)
+
+    def _moment(self) -> Moment:
+        return Moment(self.iteration, self.config.steps, self._epoch, self.mesh.num_cells, self.budget)
+
+    def _motion_rate(self) -> float | None:
+        """Rate of the vertices' steps, None where they stay."""
+        held = self.strategy is not None and not self.strategy.lets_move(self._moment())
+        return None if held else self.config.motion_rate_at(self.iteration)
+
+    def _move(self, rate: float | None) -> None:
+        if self.positions is None:
+            return
+        if rate is None:
+            self.positions.zero_grad()
+        elif (self.iteration + 1) % self.config.motion.every == 0:
+            self.history.moves = _added(self.history.moves, self.positions.step(rate))
+
+    def _refine_if_due(self) -> None:
+        if self.strategy is None or not self.strategy.is_due(self._moment()):
+            return
+        count = len(self._train_views)
+        positions = self.config.refinement_views_at(self.iteration, self.strategy.views, count)
+        views = [self._train_views[position] for position in positions]
+        mesh = self.mesh
+        values = self.parameters.values(self.capture.density_unit)
+        refinement = self.strategy.refine(
+            Situation(mesh, values, self._moment(), lambda: self._model(views), self._color_gradients, self._free_space)
+        )
+        if refinement is None:
+            return
+        before = self._error(views)
+        self._apply(refinement)
+        self.history.refinements.append(
+            RefinementRecord(
+                iteration=self.iteration,
+                cells_before=mesh.num_cells,
+                cells=self.mesh.num_cells,
+                vertices=self.mesh.num_vertices,
+                removed=refinement.removed,
+                added=refinement.added,
+                flipped=refinement.flipped,
+                predicted=refinement.predicted,
+                error_before=before,
+                error_after=self._error(views),
+            )
+        )
+
+    def _apply(self, refinement: Refinement) -> None:
+        for change in refinement.changes:
+            self.parameters.carry(change)
+            if self.positions:
+                self.positions.carry(change)
+            self._mesh = change.mesh
+        # Also those that have moved there since.
+        self.parameters.keep_free(self._free_space.contains(self._sites()))
+        if refinement.surplus is not None:
+            self.parameters.add(refinement.surplus, self.capture.density_unit)
+
+    def _model(self, views: Sequence[int]) -> ImageModel:
+        """Mean over views of the quadratic models of the squared error, densities in the capture's unit."""
+        field = self.parameters.detached_field()
+        background = self.config.background_at(self.iteration)
+        deterministic = self.config.deterministic
+        models = (
+            model_image(
+                self.mesh,
+                field,
+                self.capture.cameras[view],
+                true_image(self.capture, view, background),
+                background,
+                deterministic=deterministic,
+                valid=None if self.capture.valid is None else self.capture.valid[view],
+            )
+            for view in views
+        )
+        return reduce(add, models).scaled(1.0 / len(views)).with_density_unit(self.capture.density_unit)
+
+    def _share(self, view: int) -> float:
+        """Share of a view's pixels that count, by which means over all pixels are divided; never 0."""
+        return max(valid_share(self.capture, view), _LEAST_SHARE)
+
+    def _error(self, views: Sequence[int]) -> float:
+        """Mean squared error over views."""
+        field = self.parameters.detached_field()
+        background = self.config.background_at(self.iteration)
+        errors = []
+        for view in views:
+            truth = true_image(self.capture, view, background)
+            image = rendered_image(self.mesh, field, self.capture, view, background)
+            squares = (where_valid(self.capture, view, image, truth) - truth).square()
+            errors.append(float(squares.mean()) / self._share(view))
+        return sum(errors) / len(errors)
+
+    def _color_gradients(self) -> torch.Tensor:
+        """(V,) sums over all training views of the absolute derivatives of the loss by the vertices' colours."""
+        background = self.config.background_at(self.iteration)
+        total = torch.zeros_like(self.parameters.density, requires_grad=False)
+        for view in self._train_views:
+            self.parameters.zero_grad()
+            self._accumulate(self.mesh, view, background, 1.0)
+            gradient = self.parameters.color.grad
+            if gradient is not None:
+                total += gradient.abs().sum(1)
+        return total
+
+    def _accumulate(
+        self, mesh: TetMesh, view: int, background: tuple[float, float, float], weight: float
+    ) -> tuple[float, float]:
+        """Adds a view's gradient; returns its loss and mean squared error."""
+        device = mesh.vertices.device
+        truth = true_image(self.capture, view, background).to(device)
+        image = render(
+            mesh,
+            self.parameters.field(self.config.bands_at(self.iteration)),
+            self.capture.cameras[view],
+            background=torch.tensor(background, device=device),
+            deterministic=self.config.deterministic,
+        ).color
+        image = where_valid(self.capture, view, image, truth)
+        share = self._share(view)
+        loss = LOSSES[self.config.loss](image, truth) / share
+        if self.config.sparsity:
+            loss = loss + self.config.sparsity * sparsity(self.parameters.density)
+        (weight * loss).backward()
+        return float(loss.detach()), float((image.detach() - truth).square().mean()) / share
+
+
+def _added(totals: MoveTotals, report: StepReport) -> MoveTotals:
+    return MoveTotals(*(a + b for a, b in zip(astuple(totals), (1, *astuple(report)), strict=True)))
+
+
+def _start(capture: Capture, config: FitConfig, strategy: Strategy | None, mesh: TetMesh | None) -> Start:
+    if mesh is not None:
+        return Start(mesh)
+    if config.initial_mesh is not None:
+        return load_start(capture, config, strategy)
+    return Start(starting_mesh(capture, config, strategy))

@@ -1,0 +1,8 @@
+"""How do the cells of a mesh change: bisection, collapse, flips, insertion, removal, star subdivision?
+
+Each returns a :class:`~difftetvr.mesh.changes.change.MeshChange`: the new mesh, and how data is carried over to it.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

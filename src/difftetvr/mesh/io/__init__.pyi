@@ -1,0 +1,39 @@
+from . import content as content
+from . import formats as formats
+from . import loading as loading
+from . import saving as saving
+from . import source as source
+from .formats.npz import is_mesh_archive as is_mesh_archive
+from .loading import FIELD_ARRAYS as FIELD_ARRAYS
+from .loading import HARMONICS as HARMONICS
+from .loading import Flat as Flat
+from .loading import MeshData as MeshData
+from .loading import load as load
+from .loading import load_data as load_data
+from .loading import load_mesh as load_mesh
+from .loading import load_with_optional_field as load_with_optional_field
+from .saving import GEOMETRY_SUFFIXES as GEOMETRY_SUFFIXES
+from .saving import WRITABLE_SUFFIXES as WRITABLE_SUFFIXES
+from .saving import require_writable_format as require_writable_format
+from .saving import save as save
+
+__all__ = [
+    "FIELD_ARRAYS",
+    "GEOMETRY_SUFFIXES",
+    "HARMONICS",
+    "WRITABLE_SUFFIXES",
+    "Flat",
+    "MeshData",
+    "content",
+    "formats",
+    "is_mesh_archive",
+    "load",
+    "load_data",
+    "load_mesh",
+    "load_with_optional_field",
+    "loading",
+    "require_writable_format",
+    "save",
+    "saving",
+    "source",
+]

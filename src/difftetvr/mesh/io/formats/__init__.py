@@ -1,0 +1,8 @@
+"""What does each format of mesh files look like?
+
+A file a format, named after it.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,153 @@
+"""Formats that meshio reads and writes for us."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from difftetvr.errors import MeshError
+from difftetvr.mesh.io.content import CellBlock, Content, damaged
+
+_WRITERS: dict[str, tuple[str, dict[str, Any]]] = {
+    ".vtu": ("vtu", {"binary": True, "compression": "zlib"}),
+    ".vtk": ("vtk", {"binary": True}),
+    ".msh": ("gmsh", {"binary": True}),
+    ".mesh": ("medit", {}),
+}
+"""Format name and options of meshio by suffix."""
+
+SUFFIXES = tuple(_WRITERS)
+"""Suffixes of the formats that `write` writes."""
+
+_PIECE = re.compile(rb"<Piece\b")
+_COMPRESSOR = re.compile(rb"""<VTKFile\b[^>]*\bcompressor\s*=\s*["'](\w+)["']""")
+_KNOWN_COMPRESSORS = (b"vtkZLibDataCompressor", b"vtkLZMADataCompressor")
+
+
+def read(path: Path) -> Content:
+    """Read a file in any format that meshio knows.
+
+    Args:
+        path: The file; its suffix names the format.
+
+    Raises:
+        MeshError: It cannot be read.
+    """
+    import meshio  # late: it loads every format it knows
+
+    return _content(path, lambda: meshio.read(path))
+
+
+def read_vtu(path: Path) -> Content:
+    """Read a .vtu file of one piece, compressed with zlib, LZMA or not at all.
+
+    Args:
+        path: The file.
+
+    Raises:
+        MeshError: It cannot be read.
+    """
+    text = path.read_bytes()
+    compressor = _COMPRESSOR.search(text)
+    if compressor is not None and compressor.group(1) not in _KNOWN_COMPRESSORS:
+        name = compressor.group(1).decode()[:40]
+        raise MeshError(f"{path} is compressed with {name}, which cannot be read; write it with zlib or uncompressed.")
+    # meshio would read all pieces' points but the cells of the last piece only.
+    if (pieces := len(_PIECE.findall(text))) > 1:
+        raise MeshError(f"{path} consists of {pieces} pieces; merge them into one, as ParaView's filters do.")
+    return read(path)
+
+
+def read_xdmf(path: Path) -> Content:
+    """Read an .xdmf file of one grid; its arrays may lie in the file, in binary files beside it, or in HDF5 files.
+
+    Args:
+        path: The file. Arrays in HDF5 need the package h5py.
+
+    Raises:
+        MeshError: It cannot be read.
+    """
+    from difftetvr.mesh.io.formats.xdmf import GuardedReader
+
+    return _content(path, lambda: GuardedReader(path).read())
+
+
+def write(path: Path, suffix: str, vertices: np.ndarray, tets: np.ndarray, data: dict[str, dict[str, Any]]) -> None:
+    """Write a tetrahedral mesh with its data.
+
+    Args:
+        path: The file to write.
+        suffix: Names the format; one of `SUFFIXES`.
+        vertices: (V, 3) positions.
+        tets: (T, 4) vertex indices.
+        data: "point_data" and "cell_data", arrays by name.
+    """
+    import meshio
+
+    file_format, options = _WRITERS[suffix]
+    cell_data = {name: [values] for name, values in data["cell_data"].items()}
+    content = meshio.Mesh(vertices, [("tetra", tets)], point_data=data["point_data"], cell_data=cell_data)
+    with _quiet():
+        content.write(str(path), file_format=file_format, **options)
+
+
+def _content(path: Path, read_mesh: Callable[[], Any]) -> Content:
+    output = io.StringIO()
+    try:
+        with _quiet(output):
+            mesh = read_mesh()
+        content = _converted(mesh)
+    except MeshError:
+        raise
+    except MemoryError as error:
+        raise damaged(path, "it needs more memory than there is") from error
+    # meshio's readers fail on broken files with whatever their parsers raise, and leave the process where none fits.
+    except (Exception, SystemExit) as error:
+        reason = _printed_reason(output.getvalue()) if isinstance(error, SystemExit) else _first_line(error)
+        raise MeshError(
+            f"{path} cannot be read as a mesh ({reason}); check that it is complete and that meshio knows its format "
+            "and compression (zlib or none)."
+        ) from error
+    if "cannot handle" in output.getvalue() or "corrupt" in output.getvalue():
+        raise damaged(path, _first_line(" ".join(output.getvalue().split())))
+    return content
+
+
+def _converted(mesh: Any) -> Content:
+    blocks, begin = [], 0
+    for block in mesh.cells:
+        rows = np.arange(begin, begin + len(block.data))
+        begin += len(rows)
+        is_table = isinstance(block.data, np.ndarray) and block.data.ndim == 2
+        blocks.append(CellBlock(block.type, block.data if is_table else np.empty((len(rows), 0), np.int64), rows))
+    cell_data = {name: np.concatenate(values) for name, values in mesh.cell_data.items()}
+    return Content(np.asarray(mesh.points), tuple(blocks), dict(mesh.point_data), cell_data)
+
+
+def _first_line(message: object) -> str:
+    lines = [line.strip() for line in str(message).splitlines() if line.strip()]
+    return lines[0][:200].rstrip(".") if lines else type(message).__name__
+
+
+def _printed_reason(output: str) -> str:
+    """What meshio printed before it gave up, less its last words, which repeat the path."""
+    lines = [line for line in output.splitlines() if line.strip() and not line.startswith("Error:")]
+    return _first_line(lines[0]) if lines else "it breaks its format's rules"
+
+
+@contextlib.contextmanager
+def _quiet(output: io.StringIO | None = None) -> Iterator[None]:
+    """Keeps meshio from printing: its messages are either in the error we raise or of no use to the user."""
+    sink = io.StringIO() if output is None else output
+    with contextlib.redirect_stdout(sink), contextlib.redirect_stderr(sink), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        # NumPy only warns of, and cuts off, what follows the last number that it understands.
+        warnings.filterwarnings("error", message="string or file could not be read to its end")
+        yield

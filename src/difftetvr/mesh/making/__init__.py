@@ -1,0 +1,8 @@
+"""Where do meshes come from: boxes, points, surfaces, other cells, and files that are almost valid?
+
+Each gives arrays that :class:`~difftetvr.TetMesh` accepts, or a sentence that says why it cannot.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,7 @@
+from . import faces as faces
+from . import incidence as incidence
+from . import link as link
+from . import rings as rings
+from . import topology as topology
+
+__all__ = ["faces", "incidence", "link", "rings", "topology"]

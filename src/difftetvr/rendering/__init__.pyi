@@ -1,0 +1,33 @@
+from . import api as api
+from . import autograd as autograd
+from . import cameras as cameras
+from . import clip_plane as clip_plane
+from . import gauss_newton as gauss_newton
+from . import inspection as inspection
+from . import kernels as kernels
+from . import scalar_field as scalar_field
+from . import tracers as tracers
+from . import traversal as traversal
+from .api import RenderedImage as RenderedImage
+from .api import render as render
+from .cameras.pinhole import Camera as Camera
+from .scalar_field import ScalarField as ScalarField
+from .tracers.projected import OrderWarning as OrderWarning
+
+__all__ = [
+    "Camera",
+    "OrderWarning",
+    "RenderedImage",
+    "ScalarField",
+    "api",
+    "autograd",
+    "cameras",
+    "clip_plane",
+    "gauss_newton",
+    "inspection",
+    "kernels",
+    "render",
+    "scalar_field",
+    "tracers",
+    "traversal",
+]

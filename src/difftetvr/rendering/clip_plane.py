@@ -1,0 +1,47 @@
+"""Half-spaces that cut a volume open."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+from difftetvr.errors import DiffTetError
+from difftetvr.rendering.cameras.pinhole import Camera
+
+
+def clip_limits(plane: Any, camera: Camera, like: torch.Tensor) -> torch.Tensor:
+    """Distances between which each ray lies in a half-space, in front of the camera.
+
+    Differentiable in the plane and in the camera's pose: the plane stands still in the world.
+
+    Args:
+        plane: (4,) a, b, c, d of the half-space a x + b y + c z + d >= 0 in world space.
+        camera: The camera.
+        like: A tensor whose precision and device the result gets.
+
+    Returns:
+        (H, W, 2) first and last distance in world units; the second may be infinite, or smaller than the first where a
+        ray never enters.
+
+    Raises:
+        DiffTetError: These are not four finite numbers, or the normal (a, b, c) is zero.
+    """
+    try:
+        coefficients = torch.as_tensor(plane, dtype=like.dtype, device=like.device)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise DiffTetError(f"clip_plane is {plane!r}; give the four numbers a, b, c, d.") from error
+    values = coefficients.detach()
+    if values.shape != (4,) or not bool(torch.isfinite(values).all()) or not bool(values[:3].any()):
+        raise DiffTetError(f"clip_plane is {plane!r}; give four finite numbers a, b, c, d, the first three not all 0.")
+    pose = camera.world_to_camera.to(like)
+    normal = pose[:3, :3] @ coefficients[:3]
+    at_camera = coefficients[3] - normal @ pose[:3, 3]
+    directions = camera.ray_directions().to(like.dtype)  # before the device: not all of them know float64
+    slope = directions.to(like.device) @ normal
+    # Along a ray the plane's function is slope * t + at_camera.
+    crossing = -at_camera / torch.where(slope == 0, 1.0, slope)
+    nowhere = torch.where(at_camera < 0, -1.0, torch.inf)
+    near = torch.where(slope > 0, crossing.clamp(min=0), 0.0)
+    far = torch.where(slope < 0, crossing, torch.where(slope == 0, nowhere, torch.inf))
+    return torch.stack((near, far), dim=-1)

@@ -1,0 +1,108 @@
+"""What rays meet: depth complexity and the quality of cells (Dr.Jit kernel)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import torch
+
+from difftetvr.backend import backend_for
+from difftetvr.mesh import Field, TetMesh
+from difftetvr.rendering.api import prepare_view
+from difftetvr.rendering.cameras.pinhole import Camera
+from difftetvr.rendering.traversal.crossing import Rays, Span, Step, Tracer, corner_of, read_vertex
+from difftetvr.rendering.traversal.walk import Corner, Face
+
+
+@dataclass(frozen=True)
+class RayStatistics:
+    """What the rays of a view meet.
+
+    Attributes:
+        depth_complexity: (H, W) int32, number of cells that each ray crosses.
+        worst_quality: (H, W) least quality Q of these cells, in (0, 1]; NaN where a ray meets none.
+    """
+
+    depth_complexity: torch.Tensor
+    worst_quality: torch.Tensor
+
+
+@torch.no_grad()
+def inspect_rays(
+    mesh: TetMesh,
+    camera: Camera,
+    renderer: str = "marching",
+    clip_plane: Sequence[float] | torch.Tensor | None = None,
+) -> RayStatistics:
+    """Count the cells that rays cross, and find the worst of them (as the front end of the original does).
+
+    Args:
+        mesh: The mesh.
+        camera: The camera.
+        renderer: How crossings are found, see :func:`difftetvr.render`.
+        clip_plane: Only cells that reach into this half-space on the ray count; see there, too.
+
+    Returns:
+        The statistics, on the device of the mesh.
+
+    Raises:
+        DiffTetError: There is no such renderer, or the plane is none.
+        BackendError: No back end runs on the device of the mesh.
+    """
+    quality = mesh.quality()
+    # A field per cell makes the smallest vertex records; its first channel carries the quality.
+    color = torch.stack((quality, torch.zeros_like(quality), torch.zeros_like(quality)), dim=1)
+    view = prepare_view(mesh, Field(color, torch.zeros_like(quality), "cell"), camera, None, 0.0, False, renderer)
+    backend, size = backend_for(mesh.vertices), (camera.height, camera.width)
+    limits = view.limits(clip_plane)
+    with backend.exclusive():
+        tracer = view.task.tracer(view.vertices, limits, view.parts)
+        count = dr.zeros(backend.Int, camera.height * camera.width)
+        worst = dr.zeros(backend.Float, camera.height * camera.width)
+        tracer.trace(lambda rays: _InspectionKernel(tracer, rays, count, worst))
+        counts, least = backend.tensor(count, *size), backend.tensor(worst, *size)
+    return RayStatistics(counts, torch.where(counts > 0, least, torch.nan))
+
+
+@dataclass
+class _Inspected:
+    count: Any
+    worst: Any
+    transmittance: Any
+
+
+class _InspectionKernel:
+    """Looks at cells; see :class:`difftetvr.rendering.traversal.crossing.Kernel`."""
+
+    def __init__(self, tracer: Tracer, rays: Rays, count: Any, worst: Any) -> None:
+        self.view, self.rays, self.count, self.worst = tracer.view, rays, count, worst
+        self.span = Span.of(tracer, rays)
+
+    def start(self) -> _Inspected:
+        real, lanes = self.view.backend.Float, dr.width(self.rays.pixel)
+        return _Inspected(dr.zeros(self.view.backend.Int, lanes), dr.full(real, dr.inf, lanes), dr.ones(real, lanes))
+
+    def read(self, vertex: Any, active: Any) -> Corner:
+        position, attributes = read_vertex(self.view, vertex, active)
+        return corner_of(self.rays.frame, vertex, position, attributes, 0)
+
+    def visit(self, step: Step, ray: _Inspected) -> _Inspected:
+        quality = dr.gather(self.view.backend.Float4, self.view.cells, step.cell)[0]
+        # What lies behind the camera or is clipped is not met, whichever renderer comes across it.
+        met = dr.mask_t(quality)(True)
+        if self.span is not None:
+            met &= step.leaving[0] > self.span.near
+            if self.span.far is not None:
+                met &= step.entry[0] < self.span.far
+        count = ray.count + dr.select(met, 1, 0)
+        return _Inspected(count, dr.select(met, dr.fmin(ray.worst, quality), ray.worst), ray.transmittance)
+
+    def leave(self, face: Face, ray: _Inspected, active: Any) -> _Inspected:
+        return ray
+
+    def finish(self, ray: _Inspected) -> None:
+        dr.scatter(self.count, ray.count, self.rays.pixel, self.rays.valid)
+        dr.scatter(self.worst, ray.worst, self.rays.pixel, self.rays.valid)

@@ -1,0 +1,80 @@
+"""The marching renderer: rays walk from cell to cell, front to back (Dr.Jit).
+
+Nothing is sorted and nothing stored per crossing: the adjoint walks again and keeps what of the image is still ahead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import torch
+
+from difftetvr.mesh import TetMesh
+from difftetvr.rendering.tracers.entry import EntryLists, find_entries
+from difftetvr.rendering.traversal.crossing import Kernel, Rays, Step, View, make_rays
+from difftetvr.rendering.traversal.walk import BOUNDARY, Face, interpolate, make_face, table_row, walk_table
+
+
+@dataclass
+class Marching:
+    """Walks along cell adjacency.
+
+    Attributes:
+        view: What kernels read.
+        table: Walk table, see :func:`difftetvr.rendering.traversal.walk.walk_table`.
+        entries: Entry lists of this view.
+    """
+
+    view: View
+    table: Any
+    entries: EntryLists
+
+    @staticmethod
+    def of(view: View, mesh: TetMesh, vertices: torch.Tensor) -> Marching:
+        """Prepare a view of a mesh with (V, 3) vertices in camera space."""
+        table = view.backend.uints(walk_table(mesh))
+        return Marching(view, table, find_entries(view.backend, mesh, vertices, view.camera))
+
+    @property
+    def starts_inside(self) -> bool:
+        """Whether some walks start behind the camera."""
+        return self.entries.camera_inside
+
+    def trace(self, make_kernel: Callable[[Rays], Kernel]) -> None:
+        """Walk every ray through all cells it crosses, front to back."""
+        rays = make_rays(self.view)
+        kernel = make_kernel(rays)
+        kernel.finish(self._walk(kernel, rays))
+
+    def _walk(self, kernel: Kernel, rays: Rays) -> Any:
+        uint = self.view.backend.UInt
+        offset = dr.gather(uint, self.entries.offset, rays.pixel, rays.valid)
+        count = dr.gather(uint, self.entries.count, rays.pixel, rays.valid)
+
+        def enter(index: Any, ray: Any) -> tuple[Any, Any]:
+            active = (index < count) & rays.valid
+            row = dr.gather(uint, self.entries.rows, offset + index, active)
+            cell = dr.gather(uint, self.entries.cells, row, active)
+            apex = dr.gather(uint, self.entries.apices, row, active)
+            vertices = [dr.gather(uint, self.entries.corners, 3 * row + k, active) for k in range(3)]
+            face = make_face([kernel.read(vertex, active) for vertex in vertices])
+            state = (active, cell, apex, face, interpolate(face), ray)
+            state = dr.while_loop(state, lambda active, *_: active, advance)
+            return index + 1, kernel.leave(state[3], state[5], active)
+
+        def advance(active: Any, cell: Any, apex: Any, face: Face, entry: list[Any], ray: Any) -> tuple[Any, ...]:
+            step = Step.through(cell, face, entry, kernel.read(apex, active))
+            ray = kernel.visit(step, ray)
+            link = table_row(cell, step.exit.vertex(face), face, step.apex)
+            behind = dr.gather(self.view.backend.UInt2, self.table, link, active)
+            active = active & (behind[0] != BOUNDARY) & (ray.transmittance > self.view.threshold)
+            return active, behind[0], behind[1], step.next_face, step.leaving, ray
+
+        ray = kernel.start()
+        if self.entries.is_simple:
+            return enter(uint(0), ray)[1]
+        more = lambda index, ray: (index < count) & rays.valid & (ray.transmittance > self.view.threshold)  # noqa: E731
+        return dr.while_loop((dr.zeros(uint, dr.width(rays.pixel)), ray), more, enter)[1]

@@ -1,0 +1,115 @@
+"""The projected-tetrahedra renderer: cells sorted front to back, composited tile by tile (article appendix 10; Dr.Jit).
+
+One order serves the whole view, so nothing is sorted per pixel and nothing is known of neighbours: loose cells render,
+too. Memory does not grow with the image or its depth complexity. As in the article the order may be only approximate
+where the mesh is not convex or has no order at all; then a warning says so.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import torch
+
+from difftetvr.mesh import TetMesh
+from difftetvr.mesh.topology.topology import LOCAL_FACES
+from difftetvr.rendering.tracers.cell_order import visibility_order
+from difftetvr.rendering.tracers.entry_table import HalfFaceScene
+from difftetvr.rendering.tracers.tiles import TILE_BITS, TileLists, Tiler
+from difftetvr.rendering.traversal.crossing import Kernel, Rays, View, cross_cell, make_rays
+from difftetvr.rendering.traversal.rays import edge_function, is_left
+
+PAIR_BUDGET = 1 << 23
+"""Pairs of cell and tile that are held at a time."""
+
+
+class OrderWarning(UserWarning):
+    """Cells are composited in an order that may be wrong in places."""
+
+
+@dataclass
+class Projected:
+    """Composites cells in one order.
+
+    Attributes:
+        view: What kernels read.
+        scene: The cells.
+        tiler: Sorts them into tiles.
+        starts_inside: Whether some crossings may begin behind the camera.
+    """
+
+    view: View
+    scene: HalfFaceScene
+    tiler: Tiler
+    starts_inside: bool
+
+    @staticmethod
+    def of(view: View, mesh: TetMesh, vertices: torch.Tensor) -> Projected:
+        """Prepare a view of a mesh with (V, 3) vertices in camera space."""
+        cells = visibility_order(mesh, vertices)
+        if not cells.exact:
+            warnings.warn(
+                "The cells of this mesh have no certain front-to-back order for the whole view (it is not convex, has "
+                "cells that overlap cyclically, or loose ones), so renderer='projected' may blend some in the wrong "
+                "order; renderer='marching' is exact for meshes of joined cells.",
+                OrderWarning,
+                stacklevel=2,
+            )
+        scene = HalfFaceScene.of(view.backend, view.camera, mesh, vertices)
+        starts_inside = bool(vertices.detach()[:, 2].amin() <= 0)
+        return Projected(view, scene, Tiler(scene, cells.order, PAIR_BUDGET), starts_inside)
+
+    def trace(self, make_kernel: Callable[[Rays], Kernel]) -> None:
+        """Cross the cells of every tile, front to back."""
+        rays = make_rays(self.view)
+        kernel = make_kernel(rays)
+        ray = kernel.start()
+        for part in self.tiler.parts:
+            ray = self._composite(kernel, rays, self.tiler.lists(part), ray)
+            self.view.backend.run(ray)
+        kernel.finish(ray)
+
+    def _composite(self, kernel: Kernel, rays: Rays, lists: TileLists, ray: Any) -> Any:
+        view, uint = self.view, self.view.backend.UInt
+        width = self.scene.pinhole.width
+        row = rays.pixel // width
+        tile = (row >> TILE_BITS) * self.tiler.columns + ((rays.pixel - row * width) >> TILE_BITS)
+        end = dr.gather(uint, lists.end, tile, rays.valid)
+
+        def cross(index: Any, ray: Any) -> tuple[Any, Any]:
+            cell = dr.gather(uint, lists.cells, index)
+            is_hit, local = self._entry(rays, cell)
+            half_face = 4 * cell + local
+
+            def hit(ray: Any) -> Any:
+                return cross_cell(kernel, cell, self.scene.indices_and_apex(half_face), ray, True)
+
+            return index + 1, dr.if_stmt((ray,), is_hit, hit, lambda ray: ray)
+
+        # A ray without a tile's list has an empty one: gathers give 0 where they are masked.
+        state = (dr.gather(uint, lists.begin, tile, rays.valid), ray)
+        more = lambda index, ray: (index < end) & (ray.transmittance > view.threshold)  # noqa: E731
+        return dr.while_loop(state, more, cross)[1]
+
+    def _entry(self, rays: Rays, cell: Any) -> tuple[Any, Any]:
+        """Whether a ray crosses a cell, and the local face through which it enters."""
+        uint = self.view.backend.UInt
+        tet = dr.gather(self.view.backend.UInt4, self.scene.tets, cell)
+        points = [rays.frame.project(*self.scene.point(tet[k])) for k in range(4)]
+        left: dict[tuple[int, int], Any] = {}
+        for i in range(4):
+            for j in range(i + 1, 4):
+                (pa, pb, _), (qa, qb, _) = points[i], points[j]
+                left[i, j] = is_left(edge_function(pa, pb, qa, qb), pa, pb, qa, qb)
+                left[j, i] = ~left[i, j]
+        is_hit, local = None, uint(0)
+        for k, (i, j, m) in enumerate(LOCAL_FACES):
+            # Counter-clockwise from outside is clockwise in the ray's plane.
+            holds = left[i, m] & left[m, j] & left[j, i]
+            is_hit = holds if is_hit is None else is_hit | holds
+            local = dr.select(holds, uint(k), local)
+        return is_hit, local

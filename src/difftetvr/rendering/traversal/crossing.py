@@ -1,0 +1,224 @@
+"""Crossings of cells by rays, and what renderers and optics agree on (Dr.Jit).
+
+A renderer, here a *tracer*, answers which cells each ray crosses, in which order, from where to where. A *kernel*
+answers what a crossing does: it gathers light (``forward``) or derivatives (``adjoint``). Every kernel runs in every
+tracer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import drjit as dr
+
+from difftetvr.backend import Backend
+from difftetvr.optics import OpticalModel
+from difftetvr.rendering.cameras.pinhole import Camera
+from difftetvr.rendering.traversal.rays import Frame, Pinhole, lane_count, lane_pixel, pixel_frame
+from difftetvr.rendering.traversal.transfer import Transfer
+from difftetvr.rendering.traversal.walk import Corner, Exit, Face, find_exit, interpolate, make_face
+
+
+@dataclass
+class View:
+    """What kernels read of a mesh with its field, seen from a camera, as flat Dr.Jit arrays.
+
+    Attributes:
+        backend: Array types.
+        camera: Image size (the intrinsics are read from the device).
+        optics: Optical model of one cell.
+        vertices: Vertex records: (V, 4) x, y, z in camera space and the scalar, 0 for per-cell fields; or (V, 8)
+            x, y, z, density, linear RGB and 0, so that one cache line holds all of a vertex.
+        cells: (T, 4) linear RGB and density for per-cell fields, else None.
+        transfer: Transfer function of the vertices' scalars, None where vertices have densities and colours.
+        threshold: Transmittance below which a ray stops, as a device value.
+        limits: (H, W, 2) distances between which each ray is looked at, None for all in front of the camera.
+    """
+
+    backend: Backend
+    camera: Camera
+    optics: OpticalModel
+    vertices: Any
+    cells: Any | None
+    transfer: Transfer | None
+    threshold: Any
+    limits: Any | None
+
+
+def vertex_records(backend: Backend, vertices: Any, density: Any, color: Any) -> Any:
+    """Flat (V, 8) records x, y, z, density, red, green, blue, 0 from flat arrays, in one pass on all cores."""
+    real = backend.Float
+    vertex = dr.arange(backend.UInt, dr.width(density))
+    x, y, z = (dr.gather(real, vertices, 3 * vertex + k) for k in range(3))
+    r, g, b = (dr.gather(real, color, 3 * vertex + k) for k in range(3))
+    records = dr.empty(real, 8 * dr.width(density))
+    dr.scatter(records, backend.Float4(x, y, z, density), 2 * vertex)
+    dr.scatter(records, backend.Float4(r, g, b, real(0)), 2 * vertex + 1)
+    backend.run(records)
+    return records
+
+
+@dataclass
+class Rays:
+    """The rays of a kernel's lanes."""
+
+    pixel: Any
+    valid: Any
+    frame: Frame
+
+
+def make_rays(view: View, first: int = 0, last: int | None = None) -> Rays:
+    """Rays of all pixels, one a lane, in Morton order; or those of the lanes from ``first`` to before ``last``."""
+    uint = view.backend.UInt
+    pinhole = Pinhole.of(view.backend, view.camera)
+    lane = dr.arange(uint, (lane_count(view.camera) if last is None else last) - first)
+    if first:
+        lane += view.backend.opaque_uint(first)
+    column, row, valid = lane_pixel(pinhole, lane)
+    return Rays(row * pinhole.width + column, valid, pixel_frame(pinhole, column, row))
+
+
+@dataclass
+class Step:
+    """One crossing of a cell: the faces it enters and leaves through, and the interpolated values there."""
+
+    cell: Any
+    face: Face
+    apex: Corner
+    exit: Exit
+    next_face: Face
+    entry: list[Any]
+    leaving: list[Any]
+
+    @staticmethod
+    def through(cell: Any, face: Face, entry: list[Any], apex: Corner) -> Step:
+        """The crossing that enters a cell through a face, where the values are ``entry``."""
+        way_out = find_exit(face, apex)
+        next_face = way_out.face(face, apex)
+        return Step(cell, face, apex, way_out, next_face, entry, interpolate(next_face))
+
+
+class Kernel(Protocol):
+    """What is done at crossings. A ray's state is a PyTree with a ``transmittance``."""
+
+    def start(self) -> Any:
+        """State of the rays before their first crossing."""
+
+    def read(self, vertex: Any, active: Any) -> Corner:
+        """A vertex as the ray sees it."""
+
+    def visit(self, step: Step, ray: Any) -> Any:
+        """Cross a cell; the corners that stay are those of the next step's entry face. Returns the new state."""
+
+    def leave(self, face: Face, ray: Any, active: Any) -> Any:
+        """Finish what the corners carry at a face with no next step behind it. Returns the new state."""
+
+    def finish(self, ray: Any) -> None:
+        """Store what is to be kept of the rays."""
+
+
+class Tracer(Protocol):
+    """Finds the crossings of all rays of a view and orders them front to back."""
+
+    view: View
+    starts_inside: bool
+    """Whether some crossings begin behind the camera and must be clipped there."""
+
+    def trace(self, make_kernel: Callable[[Rays], Kernel]) -> None:
+        """Run a kernel on all crossings."""
+
+
+def cross_cell(kernel: Kernel, cell: Any, vertices: list[Any], ray: Any, active: Any) -> Any:
+    """One crossing on its own, that shares no corner with the one before or behind it.
+
+    Args:
+        kernel: What to do.
+        cell: The cell.
+        vertices: Corners of the face through which the ray enters, counter-clockwise in its plane, and the apex.
+        ray: State of the rays.
+        active: Mask.
+
+    Returns:
+        The new state.
+    """
+    corners = [kernel.read(vertex, active) for vertex in vertices]
+    face = make_face(corners[:3])
+    step = Step.through(cell, face, interpolate(face), corners[3])
+    ray = kernel.visit(step, ray)
+    return kernel.leave(step.next_face, ray, active)
+
+
+def read_vertex(view: View, vertex: Any, active: Any) -> tuple[Any, list[Any]]:
+    """A vertex's position record and its attributes: density and linear RGB, a scalar, or none for per-cell fields."""
+    float4 = view.backend.Float4
+    if view.transfer is not None:
+        position = dr.gather(float4, view.vertices, vertex, active)
+        return position, [position[3]]
+    if view.cells is not None:
+        return dr.gather(float4, view.vertices, vertex, active), []
+    position = dr.gather(float4, view.vertices, 2 * vertex, active)
+    color = dr.gather(float4, view.vertices, 2 * vertex + 1, active)
+    return position, [position[3], color[0], color[1], color[2]]
+
+
+def corner_of(frame: Frame, vertex: Any, record: Any, values: list[Any], adjoints: int) -> Corner:
+    """A vertex record as a ray sees it, with ``adjoints`` accumulators at zero."""
+    a, b, t = frame.project(record[0], record[1], record[2])
+    zero = type(a)(0)
+    return Corner(vertex, a, b, [t, *values], [zero for _ in range(adjoints)])
+
+
+def inverse_length(t0: Any, t1: Any) -> Any:
+    """One over the length of a crossing, 1 where rounding leaves none."""
+    return 1.0 / dr.select(t1 > t0, t1 - t0, 1.0)
+
+
+@dataclass
+class Span:
+    """The part of each ray that is looked at, from distance ``near`` to ``far``; no end where ``far`` is None."""
+
+    near: Any
+    far: Any | None
+
+    @staticmethod
+    def of(tracer: Tracer, rays: Rays) -> Span | None:
+        """What the view asks for; None where nothing has to be clipped."""
+        view = tracer.view
+        if view.limits is not None:
+            limits = dr.gather(view.backend.Float2, view.limits, rays.pixel, rays.valid)
+            return Span(limits[0], limits[1])
+        return Span(view.backend.Float(0), None) if tracer.starts_inside else None
+
+    def clip(self, t0: Any, t1: Any) -> Clip:
+        """The part of a crossing from t0 to t1 that lies in the span."""
+        inverse = inverse_length(t0, t1)
+        at_near = t0 < self.near
+        first = dr.select(at_near, dr.fmin((self.near - t0) * inverse, 1.0), 0.0)
+        if self.far is None:
+            return Clip(first, type(first)(1), at_near, dr.zeros(dr.mask_t(first)))
+        at_far = t1 > self.far
+        last = dr.select(at_far, dr.fmax((self.far - t0) * inverse, 0.0), 1.0)
+        return Clip(first, dr.fmax(last, first), at_near, at_far)
+
+
+@dataclass
+class Clip:
+    """The part of a crossing from x = ``first`` to ``last`` in [0, 1], and whether the span's ends decide it."""
+
+    first: Any
+    last: Any
+    at_near: Any
+    at_far: Any
+
+    def start(self, entry: list[Any], leaving: list[Any]) -> list[Any]:
+        """Values where the part starts; exactly those where it ends if it is none."""
+        begins = self.first < 1.0
+        return [dr.select(begins, dr.fma(self.first, v1 - v0, v0), v1) for v0, v1 in zip(entry, leaving, strict=True)]
+
+    def end(self, entry: list[Any], leaving: list[Any]) -> list[Any]:
+        """Values where the part ends."""
+        return [
+            dr.select(self.at_far, dr.fma(self.last, v1 - v0, v0), v1) for v0, v1 in zip(entry, leaving, strict=True)
+        ]

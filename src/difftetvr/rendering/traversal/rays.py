@@ -1,0 +1,131 @@
+"""Pixels, rays and the exact 2-D predicates that every renderer shares (Dr.Jit).
+
+Each ray has an orthonormal frame (a, b, direction) with a x b = direction, and starts at the camera, the origin of
+camera space. A vertex seen by a ray is (a, b, t): its offset from the ray's line and its distance along it. Whether a
+ray meets a face is decided by signs of 2-D edge functions of (a, b) alone, never by comparing distances.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import torch
+
+from difftetvr.backend import Backend
+from difftetvr.rendering.cameras.pinhole import Camera
+
+_BLOCK_BITS = 6  # pixels are visited in Morton order inside blocks of 64 x 64
+
+
+@dataclass
+class Pinhole:
+    """Intrinsics and image size of a camera as device values, so that a new view needs no recompilation."""
+
+    inverse_fx: Any
+    inverse_fy: Any
+    fx: Any
+    fy: Any
+    cx: Any
+    cy: Any
+    width: Any
+    height: Any
+
+    @staticmethod
+    def of(backend: Backend, camera: Camera) -> Pinhole:
+        """Upload a camera's intrinsics."""
+        values = [1.0 / camera.fx, 1.0 / camera.fy, camera.fx, camera.fy, camera.cx, camera.cy]
+        floats = backend.floats(torch.tensor(values, dtype=backend.dtype, device=backend.device))
+        sizes = backend.uints(torch.tensor([camera.width, camera.height], dtype=torch.int32, device=backend.device))
+        return Pinhole(
+            *(dr.gather(backend.Float, floats, backend.UInt(i)) for i in range(6)),
+            *(dr.gather(backend.UInt, sizes, backend.UInt(i)) for i in range(2)),
+        )
+
+
+@dataclass
+class Frame:
+    """Orthonormal frame of a ray; each axis is a tuple of three Dr.Jit floats in camera space."""
+
+    a: tuple[Any, Any, Any]
+    b: tuple[Any, Any, Any]
+    direction: tuple[Any, Any, Any]
+
+    def project(self, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
+        """Coordinates (a, b, t) of a camera-space point; explicit fma, so that every kernel rounds alike."""
+        return tuple(dr.fma(e[0], x, dr.fma(e[1], y, e[2] * z)) for e in (self.a, self.b, self.direction))
+
+    def to_camera_space(self, a: Any, b: Any, t: Any) -> tuple[Any, Any, Any]:
+        """A vector given in this frame, in camera space."""
+        return tuple(dr.fma(self.a[k], a, dr.fma(self.b[k], b, self.direction[k] * t)) for k in range(3))
+
+
+def pixel_frame(pinhole: Pinhole, column: Any, row: Any) -> Frame:
+    """Frame of the ray through the centre of a pixel (Duff et al. 2017, branch-free because z > 0)."""
+    float_t = type(pinhole.fx)
+    x = ((float_t(column) + 0.5) - pinhole.cx) * pinhole.inverse_fx
+    y = ((float_t(row) + 0.5) - pinhole.cy) * pinhole.inverse_fy
+    z = 1.0 / dr.sqrt(dr.fma(x, x, dr.fma(y, y, float_t(1))))
+    x, y = x * z, y * z
+    inverse = -1.0 / (1.0 + z)
+    xy = x * y * inverse
+    a = (dr.fma(x * x, inverse, float_t(1)), xy, -x)
+    b = (xy, dr.fma(y * y, inverse, float_t(1)), -y)
+    return Frame(a, b, (x, y, z))
+
+
+def lane_count(camera: Camera) -> int:
+    """Number of kernel lanes for an image: its size rounded up to whole blocks."""
+    block = 1 << _BLOCK_BITS
+    return -(-camera.width // block) * -(-camera.height // block) * block * block
+
+
+def lane_pixel(pinhole: Pinhole, lane: Any) -> tuple[Any, Any, Any]:
+    """Column, row and validity of a lane: neighbouring lanes see neighbouring pixels, so rays share cells in cache."""
+    mask = (1 << _BLOCK_BITS) - 1
+    blocks_per_row = (pinhole.width + mask) >> _BLOCK_BITS
+    block = lane >> (2 * _BLOCK_BITS)
+    block_row = block // blocks_per_row
+    block_column = block - block_row * blocks_per_row
+    column = (block_column << _BLOCK_BITS) + _even_bits(lane)
+    row = (block_row << _BLOCK_BITS) + _even_bits(lane >> 1)
+    return column, row, (column < pinhole.width) & (row < pinhole.height)
+
+
+def pixel_lane(pinhole: Pinhole, column: Any, row: Any) -> Any:
+    """The lane of a pixel: the inverse of :func:`lane_pixel`."""
+    mask = (1 << _BLOCK_BITS) - 1
+    blocks_per_row = (pinhole.width + mask) >> _BLOCK_BITS
+    block = (row >> _BLOCK_BITS) * blocks_per_row + (column >> _BLOCK_BITS)
+    return (block << (2 * _BLOCK_BITS)) + _spread_bits(column & mask) + (_spread_bits(row & mask) << 1)
+
+
+def _spread_bits(code: Any) -> Any:
+    """Put six bits at the even places of a Morton code."""
+    code = (code | (code << 4)) & 0x30F
+    code = (code | (code << 2)) & 0x333
+    return (code | (code << 1)) & 0x555
+
+
+def _even_bits(code: Any) -> Any:
+    """Gather the six even bits of a Morton code."""
+    code = code & 0x555
+    code = (code | (code >> 1)) & 0x333
+    code = (code | (code >> 2)) & 0x30F
+    return (code | (code >> 4)) & 0x3F
+
+
+def edge_function(pa: Any, pb: Any, qa: Any, qb: Any) -> Any:
+    """Twice the signed area of (ray, p, q) in the ray's plane, with an exact sign (Kahan's difference of products)."""
+    product = pb * qa
+    error = dr.fma(-pb, qa, product)
+    return dr.fma(pa, qb, -product) + error
+
+
+def is_left(edge: Any, pa: Any, pb: Any, qa: Any, qb: Any) -> Any:
+    """Sign of an edge function; ties are broken as if the ray were shifted by (eps, eps^2).
+
+    Antisymmetric in p and q, so the cells on both sides of an edge always agree.
+    """
+    return (edge > 0) | ((edge == 0) & ((pb > qb) | ((pb == qb) & (qa > pa))))

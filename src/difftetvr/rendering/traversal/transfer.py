@@ -1,0 +1,233 @@
+"""Scalars seen through a piecewise-linear transfer function, without approximation (Dr.Jit).
+
+Inside a cell the scalar is linear along a ray. Where it passes a knot of the transfer function the crossing is cut: on
+every piece density and colour are linear again, and the optical model integrates them as it does those of a mesh's
+field. Two knots at one scalar are a jump; the piece between them has no length.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import torch
+
+from difftetvr.backend import Backend
+from difftetvr.rendering.traversal.walk import Face
+
+
+@dataclass
+class Transfer:
+    """A transfer function as kernels read it.
+
+    Attributes:
+        backend: Array types.
+        knots: (K,) scalars, not decreasing.
+        values: (K, 4) density and linear RGB.
+        count: K, as a device value.
+        bits: Steps of a binary search among the knots.
+    """
+
+    backend: Backend
+    knots: Any
+    values: Any
+    count: Any
+    bits: int
+
+    @staticmethod
+    def of(backend: Backend, knots: torch.Tensor, values: torch.Tensor) -> Transfer:
+        """Upload (K,) knots and (K, 4) densities and colours."""
+        count = knots.shape[0]
+        # A copy: the backward pass wants the knots as they are now, whatever becomes of the caller's tensor.
+        arrays = backend.floats(knots.clone()), backend.floats(values)
+        return Transfer(backend, *arrays, dr.opaque(backend.Int, count), count.bit_length())
+
+    def knot(self, index: Any, active: Any = True) -> Any:
+        """Scalar of a knot."""
+        return dr.gather(self.backend.Float, self.knots, self.backend.UInt(index), active)
+
+    def bounded(self, values: list[Any], face: Face) -> list[Any]:
+        """Distance and scalar at a face, the scalar within those of its corners.
+
+        Where these are all one number, rounding must not carry it across a jump at that number.
+        """
+        first, second, third = (corner.values[1] for corner in face.corners)
+        low, high = dr.fmin(dr.fmin(first, second), third), dr.fmax(dr.fmax(first, second), third)
+        return [values[0], dr.fmin(dr.fmax(values[1], low), high)]
+
+    def interval(self, scalar: Any, inclusive: Any) -> Any:
+        """Last knot below a scalar, or at it where ``inclusive``; -1 where there is none."""
+        integer = self.backend.Int
+        low, high = dr.zeros(integer, dr.width(scalar)), self.count + dr.zeros(integer, dr.width(scalar))
+        for _ in range(self.bits):
+            open_ = low < high
+            middle = (low + high) >> 1
+            knot = self.knot(middle, open_)
+            below = open_ & ((knot < scalar) | (inclusive & (knot == scalar)))
+            low, high = dr.select(below, middle + 1, low), dr.select(open_ & ~below, middle, high)
+        return low - 1
+
+    def cut(self, entry: list[Any], leaving: list[Any], visit: Callable[[Piece, Any], Any], state: Any) -> Any:
+        """Visit the pieces of a crossing in their order.
+
+        Args:
+            entry: Distance and scalar where it begins.
+            leaving: Distance and scalar where it ends.
+            visit: ``visit(piece, state)`` returns the new state.
+            state: A PyTree.
+
+        Returns:
+            The final state.
+        """
+        (_, f0), (_, f1) = entry, leaving
+        rises = f1 >= f0
+        inverse = 1.0 / dr.select(f1 != f0, f1 - f0, 1.0)
+
+        def advance(_: Any, begin: PieceEnd, interval: Any, state: Any) -> tuple[Any, ...]:
+            ahead = dr.select(rises, interval + 1, interval)
+            is_knot = (ahead >= 0) & (ahead < self.count)
+            knot = self.knot(ahead, is_knot)
+            cuts = is_knot & dr.select(rises, knot < f1, knot > f1)
+            x = dr.select(cuts, dr.fmax(dr.fmin((knot - f0) * inverse, 1.0), begin.x), 1.0)
+            end = PieceEnd(x, dr.select(cuts, knot, f1), cuts)
+            state = visit(Piece.of(self, entry, leaving, interval, begin, end), state)
+            return cuts, end, interval + dr.select(rises, 1, -1), state
+
+        zero = dr.zeros_like(f0)
+        first = PieceEnd(zero, f0, dr.zeros(dr.mask_t(f0), dr.width(f0)))
+        start = (dr.full(dr.mask_t(f0), True, dr.width(f0)), first, self.interval(f0, rises), state)
+        return dr.while_loop(start, lambda more, *_: more, advance)[3]
+
+
+@dataclass
+class PieceEnd:
+    """An end of a piece: its place x in [0, 1] along the crossing, its scalar, and whether a knot decides it."""
+
+    x: Any
+    scalar: Any
+    at_knot: Any
+
+
+@dataclass
+class Piece:
+    """Part of a crossing between two knots.
+
+    Attributes:
+        lower, upper: The knots; the same one outside of the first and last.
+        change: Values of the upper knot less those of the lower, density and linear RGB.
+        inverse_width: One over the distance of the knots; 0 where there is none.
+        begin, end: The ends.
+        weights: Place of each end between the knots, 0 at the lower.
+        start_values, end_values: Distance, density and linear RGB at the ends.
+    """
+
+    lower: Any
+    upper: Any
+    change: list[Any]
+    inverse_width: Any
+    begin: PieceEnd
+    end: PieceEnd
+    weights: tuple[Any, Any]
+    start_values: list[Any]
+    end_values: list[Any]
+
+    @staticmethod
+    def of(
+        transfer: Transfer, entry: list[Any], leaving: list[Any], interval: Any, begin: PieceEnd, end: PieceEnd
+    ) -> Piece:
+        """The piece of a crossing in an interval of the knots."""
+        real, uint, float4 = transfer.backend.Float, transfer.backend.UInt, transfer.backend.Float4
+        lower = uint(dr.select(interval < 0, 0, interval))
+        upper = uint(dr.select(interval + 1 < transfer.count, interval + 1, transfer.count - 1))
+        below, above = (dr.gather(float4, transfer.values, index) for index in (lower, upper))
+        low = transfer.knot(lower)
+        width = transfer.knot(upper) - low
+        inverse_width = dr.select(width > 0, 1.0 / width, real(0))
+        change = [above[k] - below[k] for k in range(4)]
+        weights, ends = [], []
+        for place in (begin, end):
+            weight = dr.fmin(dr.fmax((place.scalar - low) * inverse_width, 0.0), 1.0)
+            distance = dr.fma(place.x, leaving[0] - entry[0], entry[0])
+            weights.append(weight)
+            ends.append([distance, *(dr.fma(weight, change[k], below[k]) for k in range(4))])
+        ends[1][0] = dr.select(end.at_knot, ends[1][0], leaving[0])
+        return Piece(lower, upper, change, inverse_width, begin, end, (weights[0], weights[1]), ends[0], ends[1])
+
+
+@dataclass
+class TransferGradients:
+    """Flat gradient buffers: (K,) knots and (K, 4) densities and linear RGB."""
+
+    knots: Any
+    values: Any
+
+
+@dataclass
+class CrossingAdjoint:
+    """Derivatives by distance and scalar at both ends of a crossing, summed over its pieces."""
+
+    entry: list[Any]
+    leaving: list[Any]
+
+
+class PieceAdjoint:
+    """Hands the derivatives at a piece's ends on to knots, and to the ends of its crossing."""
+
+    def __init__(
+        self, piece: Piece, entry: list[Any], leaving: list[Any], gradients: TransferGradients, mode: dr.ReduceMode
+    ) -> None:
+        self.piece, self.gradients, self.mode = piece, gradients, mode
+        (t0, f0), (t1, f1) = entry, leaving
+        self.length = t1 - t0
+        self.inverse_rise = dr.select(f1 != f0, 1.0 / (f1 - f0), 0.0)
+
+    def add(self, at_start: list[Any], at_end: list[Any], pixel: list[Any], total: CrossingAdjoint) -> CrossingAdjoint:
+        """Add a piece's part.
+
+        Args:
+            at_start: Derivatives by distance, density and radiance <pixel, RGB> where the piece starts.
+            at_end: The same where it ends.
+            pixel: Derivatives by the pixel's linear RGB.
+            total: Sums so far.
+
+        Returns:
+            The new sums.
+        """
+        piece = self.piece
+        low, high = [at_start[0] * 0.0] * 2, [at_start[0] * 0.0] * 2
+        knot_low, knot_high = at_start[0] * 0.0, at_start[0] * 0.0
+        entry, leaving = list(total.entry), list(total.leaving)
+        change = [piece.change[0], sum((g * c for g, c in zip(pixel, piece.change[1:], strict=True)), low[0])]
+        places = ((piece.begin, piece.weights[0], at_start), (piece.end, piece.weights[1], at_end))
+        for is_end, (place, weight, gradient) in enumerate(places):
+            low = [dr.fma(1.0 - weight, g, s) for g, s in zip(gradient[1:], low, strict=True)]
+            high = [dr.fma(weight, g, s) for g, s in zip(gradient[1:], high, strict=True)]
+            # A knot's value does not depend on where the knot is, a value between knots does.
+            slope = dr.fma(gradient[1], change[0], gradient[2] * change[1]) * piece.inverse_width
+            slope = dr.select(place.at_knot, 0.0, slope)
+            knot_low = dr.fma(weight - 1.0, slope, knot_low)
+            knot_high = dr.fma(-weight, slope, knot_high)
+            # Where a knot cuts the crossing, on the other hand, it decides the distance.
+            moved = dr.select(place.at_knot, gradient[0] * self.length * self.inverse_rise, 0.0)
+            at_upper = weight > 0.5
+            knot_high += dr.select(at_upper, moved, 0.0)
+            knot_low += dr.select(at_upper, 0.0, moved)
+            entry[0] = dr.fma(1.0 - place.x, gradient[0], entry[0])
+            leaving[0] = dr.fma(place.x, gradient[0], leaving[0])
+            entry[1] = dr.fma(place.x - 1.0, moved, entry[1])
+            leaving[1] = dr.fma(-place.x, moved, leaving[1])
+            if is_end:
+                leaving[1] += slope
+            else:
+                entry[1] += slope
+        self._scatter(piece.lower, low, knot_low, pixel)
+        self._scatter(piece.upper, high, knot_high, pixel)
+        return CrossingAdjoint(entry, leaving)
+
+    def _scatter(self, knot: Any, values: list[Any], position: Any, pixel: list[Any]) -> None:
+        record = [values[0], *(values[1] * g for g in pixel)]
+        dr.scatter_add(self.gradients.knots, position, knot, mode=self.mode)
+        for k, value in enumerate(record):
+            dr.scatter_add(self.gradients.values, value, 4 * knot + k, mode=self.mode)

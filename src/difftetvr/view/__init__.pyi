@@ -1,0 +1,10 @@
+from . import compare as compare
+from . import cut as cut
+from . import describe as describe
+from . import heatmap as heatmap
+from . import pictures as pictures
+from . import plots as plots
+from . import report as report
+from .pictures import save_png as save_png
+
+__all__ = ["compare", "cut", "describe", "heatmap", "pictures", "plots", "report", "save_png"]
