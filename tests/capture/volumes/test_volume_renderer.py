@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from difftetvr.capture import TransferFunction, Volume, VolumeCapture, VolumeRenderer, fibonacci_orbit
+from difftetvr import TransferFunction
+from difftetvr.capture import Volume, VolumeCapture, VolumeRenderer, fibonacci_orbit
 from difftetvr.errors import CaptureError
 from difftetvr.rendering.cameras.pinhole import Camera
 

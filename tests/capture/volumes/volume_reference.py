@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from difftetvr.capture import TransferFunction, Volume
+from difftetvr import TransferFunction
+from difftetvr.capture import Volume
 from difftetvr.rendering.cameras.pinhole import Camera
 
 
