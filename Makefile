@@ -5,13 +5,14 @@ BIN := .venv/bin
 # Which scripts `make bench` runs; the studies of the Tooth and of photographs have commands of their own.
 BENCHMARKS ?= $(filter-out benchmarks/tooth%.py benchmarks/photos.py,$(wildcard benchmarks/*.py))
 
-.PHONY: help setup demo test lint bench clean distclean
+.PHONY: help setup demo test lint bench docs clean distclean
 
 help:
 	@echo 'make demo       reconstruct the Tooth CT scan from rendered views; pictures in out/demo'
 	@echo 'make test       lint, types and all tests'
 	@echo 'make lint       lint and types only'
 	@echo 'make bench      print the tables of docs/results.md'
+	@echo 'make docs       build the manual; begins at docs/_build/html/index.html'
 	@echo 'make setup      only set up .venv and libLLVM (the others do it too)'
 	@echo 'make clean      remove caches, builds and out/;  make distclean  .venv too'
 
@@ -37,8 +38,14 @@ lint: setup
 bench: setup
 	@for script in $(BENCHMARKS); do echo "== $$script"; $(BIN)/python "$$script" || exit 1; done
 
+# Warnings are errors. The doctrees and the gallery stay, so that the next time only what changed is made.
+docs:
+	@sh scripts/setup.sh docs
+	$(BIN)/python -m sphinx -W --keep-going -n -q -b html -d docs/_build/doctrees docs docs/_build/html
+	@echo 'docs/_build/html/index.html is the first page.'
+
 clean:
-	rm -rf out build dist .pytest_cache .hypothesis .mypy_cache .ruff_cache
+	rm -rf docs/_build docs/gallery out build dist .pytest_cache .hypothesis .mypy_cache .ruff_cache
 	find src tests examples benchmarks scripts -name __pycache__ -type d -prune -exec rm -rf {} +
 
 distclean: clean

@@ -1,4 +1,8 @@
-"""Reconstruct from photographs: a folder of images and a cameras.json, here made by rendering the built-in scan."""
+"""From photographs to a mesh
+==========================
+
+A folder of images and a ``cameras.json`` are enough. Here they are made by rendering the built-in scan.
+"""
 
 import json
 import sys
@@ -7,38 +11,34 @@ from pathlib import Path
 import torch
 
 import difftetvr as dtv
-from difftetvr.view.pictures import save_png
 
+folder = Path(sys.argv[1] if len(sys.argv) > 1 else "out/examples")
+photos = folder / "photos"
+photos.mkdir(parents=True, exist_ok=True)
 
-def take_photos(folder: Path) -> None:
-    """What your own cameras would give: images, and where each of them was taken (docs/captures.md)."""
-    views = dtv.VolumeCapture(path="tooth", views=32, width=64, height=64).build()
-    cameras = []
-    for index, camera in enumerate(views.cameras):
-        name = f"{index:03}.png"
-        save_png(folder / name, views.images[index])
-        intrinsics = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
-        cameras.append({"image": name, "world_to_camera": camera.world_to_camera.tolist(), **intrinsics})
-    (folder / "cameras.json").write_text(json.dumps({"format": "difftetvr-cameras", "cameras": cameras}))
+# %%
+# What your own cameras would give: images, and where each of them was taken.
 
+views = dtv.VolumeCapture(path="tooth", views=32, width=64, height=64).build()
+cameras = []
+for index, camera in enumerate(views.cameras):
+    name = f"{index:03}.png"
+    dtv.view.save_png(photos / name, views.images[index])
+    intrinsics = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
+    cameras.append({"image": name, "world_to_camera": camera.world_to_camera.tolist(), **intrinsics})
+(photos / "cameras.json").write_text(json.dumps({"format": "difftetvr-cameras", "cameras": cameras}))
 
-def main(folder: Path) -> None:
-    photos = folder / "photos"
-    photos.mkdir(parents=True, exist_ok=True)
-    take_photos(photos)
+# %%
+# Or your own: ``load_capture("garden", downscale=4)``, a folder of NeRF-synthetic, transforms.json or COLMAP.
 
-    # Or your own: load_capture("garden", downscale=4), a folder of NeRF-synthetic, transforms.json or COLMAP.
-    capture = dtv.load_capture(photos)
-    result = dtv.fit(capture, dtv.FitConfig(cells=5_000, iterations=150))
+capture = dtv.load_capture(photos)
+result = dtv.fit(capture, dtv.FitConfig(cells=5_000, iterations=150))
+print(f"Held-out PSNR {result.metrics['psnr']:.2f} dB with {result.mesh.num_cells} cells")
 
-    # A picture from where no camera was.
-    middle = capture.bounds.mean(0)
-    away = torch.tensor([0.6, -1.0, 0.5])
-    camera = dtv.Camera.look_at(middle + away, middle, (0, 0, 1), width=256, height=256)
-    save_png(folder / "fit_photos.png", dtv.render(result.mesh, result.field, camera).color)
-    dtv.save(folder / "fit_photos.vtu", result.mesh, result.field)
-    print(f"Held-out PSNR {result.metrics['psnr']:.2f} dB with {result.mesh.num_cells} cells; wrote {folder}")
+# %%
+# A picture from where no camera was.
 
-
-if __name__ == "__main__":
-    main(Path(sys.argv[1] if len(sys.argv) > 1 else "out/examples"))
+middle = capture.bounds.mean(0)
+camera = dtv.Camera.look_at(middle + torch.tensor([0.6, -1.0, 0.5]), middle, (0, 0, 1), width=384, height=384)
+dtv.view.save_png(folder / "fit_photos.png", dtv.render(result.mesh, result.field, camera).color)
+dtv.save(folder / "fit_photos.vtu", result.mesh, result.field)

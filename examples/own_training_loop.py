@@ -1,4 +1,11 @@
-"""Colours, densities and vertex positions in a loop of your own: the renderer is just another PyTorch operation."""
+"""A training loop of your own
+===========================
+
+The renderer is just another PyTorch operation: colours, densities and vertex positions, in a loop that you write.
+"""
+
+import sys
+from pathlib import Path
 
 import torch
 
@@ -6,38 +13,45 @@ import difftetvr as dtv
 from difftetvr.fitting import VertexOptimizer, VertexOptimizerConfig
 
 STEPS = 160
+folder = Path(sys.argv[1] if len(sys.argv) > 1 else "out/examples")
+folder.mkdir(parents=True, exist_ok=True)
 
+# %%
+# What to learn from, and what is learned. Vertices have an optimiser of their own: its steps are counted in altitudes
+# of the cells, and no cell is ever inverted.
 
-def main() -> None:
-    capture = dtv.VolumeCapture(path="tooth", views=16, width=48, height=48).build()
-    lower, upper = capture.bounds.tolist()
-    mesh = dtv.TetMesh.grid((5, 5, 8), lower, upper)
+capture = dtv.VolumeCapture(path="tooth", views=16, width=48, height=48).build()
+mesh = dtv.TetMesh.grid((5, 5, 8), *capture.bounds.tolist())
+color = torch.full((mesh.num_vertices, 3), 0.5, requires_grad=True)
+density = torch.full((mesh.num_vertices,), 0.05, requires_grad=True)
+optimizer = torch.optim.Adam([color, density], lr=0.03, betas=(0.9, 0.99), eps=1e-15)
+config = VertexOptimizerConfig(boundary="slide")
+positions = VertexOptimizer(mesh, config)
 
-    color = torch.full((mesh.num_vertices, 3), 0.5, requires_grad=True)
-    density = torch.full((mesh.num_vertices,), 0.05, requires_grad=True)
-    optimizer = torch.optim.Adam([color, density], lr=0.03, betas=(0.9, 0.99), eps=1e-15)
-    # Steps in units of the cells' altitudes; no cell is ever inverted.
-    config = VertexOptimizerConfig(boundary="slide")
-    positions = VertexOptimizer(mesh, config)
+# %%
+# The loop. After each step colours and densities are projected to where they are valid.
 
-    for step in range(STEPS + 1):
-        view = step % len(capture.cameras)
-        field = dtv.Field(color, capture.density_unit * density)
-        image = dtv.render(positions.mesh, field, capture.cameras[view]).color
-        loss = (image - capture.images[view]).square().mean()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        with torch.no_grad():
-            color.clamp_(0.0, 1.0)
-            density.clamp_(min=0.0)
-        if step % 2 == 1:  # the gradients of two views make one move
-            positions.step(config.rate_at(step / STEPS))
-            positions.zero_grad()
-        if step % 40 == 0:
-            smallest = positions.mesh.volumes().min().item()
-            print(f"step {step:3d}  PSNR {-10 * torch.log10(loss).item():.2f} dB  smallest cell {smallest:.2e}")
+for step in range(STEPS + 1):
+    view = step % len(capture.cameras)
+    image = dtv.render(positions.mesh, dtv.Field(color, capture.density_unit * density), capture.cameras[view]).color
+    loss = (image - capture.images[view]).square().mean()
+    optimizer.zero_grad()
+    loss.backward()
+    optimizer.step()
+    with torch.no_grad():
+        color.clamp_(0.0, 1.0)
+        density.clamp_(min=0.0)
+    if step % 2 == 1:  # the gradients of two views make one move
+        positions.step(config.rate_at(step / STEPS))
+        positions.zero_grad()
+    if step % 40 == 0:
+        smallest = positions.mesh.volumes().min().item()
+        print(f"step {step:3d}  PSNR {-10 * torch.log10(loss).item():.2f} dB  smallest cell {smallest:.2e}")
 
+# %%
+# The last view beside its truth, and where the vertices went.
 
-if __name__ == "__main__":
-    main()
+rows = [(f"truth, view {view}", capture.images[view], image.detach(), 1.0)]
+dtv.view.pictures.save_comparisons(folder / "own_training_loop.png", rows)
+field = dtv.Field(color.detach(), capture.density_unit * density.detach())
+dtv.view.cut.cut_picture(positions.mesh, field, size=384).save(folder / "own_training_loop_cut.png")

@@ -1,5 +1,6 @@
 #!/bin/sh
 # Everything `make` needs: a virtual environment in .venv with the pinned packages and this one, and a libLLVM.
+# `setup.sh docs` adds what the manual is made with.
 # Run again after success it returns at once; run again after an interruption it finishes the work.
 # Needs Python >= 3.10 and a POSIX shell. PYTHON=... chooses the Python.
 set -eu
@@ -8,6 +9,7 @@ cd "$(dirname "$0")/.."
 root=$(pwd -P)
 venv_python=.venv/bin/python
 stamp=.venv/setup-complete
+docs_stamp=.venv/setup-docs-complete
 installing=.venv/setup-installing
 pins=requirements/lock.txt
 
@@ -18,14 +20,22 @@ fail() {
 }
 has() { command -v "$1" >/dev/null 2>&1; }
 
-# ---- what the stamp stands for: these inputs, set up at this place
+# ---- what a stamp stands for: these inputs, set up at this place
 
 inputs() {
     printf '%s\n' "$root"
     cksum pyproject.toml "$pins" scripts/setup.sh
 }
 
-is_complete() { [ -x "$venv_python" ] && [ -f "$stamp" ] && [ "$(inputs)" = "$(cat "$stamp")" ]; }
+is_complete() { # stamp
+    [ -x "$venv_python" ] && [ -f "$1" ] && [ "$(inputs)" = "$(cat "$1")" ]
+}
+
+complete() { # stamp
+    inputs >"$1.new"
+    mv "$1.new" "$1"
+    say "ready"
+}
 
 # ---- system packages: only as root, or where sudo asks for no password
 
@@ -87,11 +97,10 @@ make_venv() {
 
 pip_install() { "$venv_python" -m pip install --disable-pip-version-check -q -c "$pins" "$@"; }
 
-install_packages() {
-    say "installing the pinned packages (PyTorch is large: the first time takes minutes)"
+install_packages() { # extra
     : >"$installing"
     # Built without isolation, so that the build too takes the pinned packages and fetches nothing else.
-    pip_install hatchling editables && pip_install --no-build-isolation -e '.[dev]' ||
+    pip_install hatchling editables && pip_install --no-build-isolation -e ".[$1]" ||
         fail "pip could not install the packages (see above); check the network and the disk, then run make again."
     rm "$installing"
 }
@@ -169,11 +178,25 @@ provide_llvm() {
 
 # ----
 
-if is_complete; then exit 0; fi
-rm -f "$stamp"
-is_venv_usable || make_venv
-install_packages
-provide_llvm
-inputs >"$stamp.new"
-mv "$stamp.new" "$stamp"
-say "ready"
+set_up() {
+    rm -f "$stamp"
+    is_venv_usable || make_venv
+    say "installing the pinned packages (PyTorch is large: the first time takes minutes)"
+    install_packages dev
+    provide_llvm
+    complete "$stamp"
+}
+
+set_up_docs() {
+    rm -f "$docs_stamp"
+    say "installing what the manual is made with"
+    install_packages docs
+    complete "$docs_stamp"
+}
+
+case ${1:-} in
+'' | docs) ;;
+*) fail "there is no '$1' to set up; say 'docs' or nothing." ;;
+esac
+is_complete "$stamp" || set_up
+[ "${1:-}" != docs ] || is_complete "$docs_stamp" || set_up_docs

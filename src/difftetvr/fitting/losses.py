@@ -24,7 +24,7 @@ def l2(image: torch.Tensor, reference: torch.Tensor) -> torch.Tensor:
 
 
 def l1_ssim(image: torch.Tensor, reference: torch.Tensor) -> torch.Tensor:
-    """Four parts of :func:`l1` and one of 1 - SSIM, as in 3-D Gaussian splatting; images of at least 11 x 11 pixels."""
+    """Four parts of `l1` and one of 1 - SSIM, as in 3-D Gaussian splatting; images of at least 11 x 11 pixels."""
     return (1.0 - _SSIM_PART) * l1(image, reference) + _SSIM_PART * (1.0 - mean_similarity(image, reference))
 
 

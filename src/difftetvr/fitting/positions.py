@@ -42,7 +42,7 @@ class StepReport:
 class VertexOptimizer:
     """Adam for vertex positions that knows the mesh.
 
-    A step goes against the mean gradient, in units of the altitude h of each vertex, plus a shape barrier:
+    A step goes against the mean gradient, in units of the altitude h of each vertex, plus a shape barrier::
 
         move = -rate * h * m / sqrt(v) - rate * h^2 * gradient of the sum of -w log Q,   w fixed
         w = barrier + wall * max(2.5 floor - Q, 0) / (Q - floor),   floor = the least Q that the guard allows
@@ -50,6 +50,7 @@ class VertexOptimizer:
     with m and v the first and second moments of h * gradient, v one number for each vertex: that of the vector's
     squared length. So the step does not depend on the unit of length, of the loss or on the axes. It is then
     confined to the boundary, capped and guarded: no cell ever inverts or falls under the floors of the options.
+    ::
 
         positions = VertexOptimizer(mesh)
         for iteration in range(n):

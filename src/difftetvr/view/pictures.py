@@ -57,7 +57,7 @@ def comparison(
 
 
 def save_comparisons(path: str | Path, rows: list[tuple[str, torch.Tensor, torch.Tensor, float]]) -> None:
-    """Writes a PNG with one :func:`comparison` below the other.
+    """Writes a PNG with one `comparison` below the other.
 
     Args:
         path: File to write.

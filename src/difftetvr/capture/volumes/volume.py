@@ -103,7 +103,7 @@ class Volume:
 
 
 def is_volume_file(path: str | Path) -> bool:
-    """Whether a file's name says that it holds a volume that :meth:`Volume.load` reads."""
+    """Whether a file's name says that it holds a volume that `Volume.load` reads."""
     name = Path(path).name.lower()
     return name.endswith((".raw", ".raw.gz", ".raw.xz", ".dat", ".nrrd", ".nhdr", ".vti"))
 

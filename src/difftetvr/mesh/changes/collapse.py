@@ -39,11 +39,13 @@ def collapse_edges(
     """Merge vertices into neighbours, cheapest first, where the mesh stays valid and its shapes stay good.
 
     Vertex v may be merged into its neighbour u if
+
     - v is not on the boundary (u may be), or with boundary="slide" both are and the boundary stays the same surface: v
       lies in a plane of it, or on a straight crease of planes and u further along the crease; corners stay;
     - the link condition Lk(u) ∩ Lk(v) = Lk(uv) holds, so the result is the same manifold;
     - all cells around v that remain have positive volume, and quality of at least `min_quality`; where the worst cell
       around v is worse than that already, none may become worse than it.
+
     The remaining cells around v then fill the same space as before, without overlap: what bounds them together is the
     same, but for faces that move within their own planes (see `keeps_surface`), and none of them is inverted.
     Collapses that are done together have no cell around their removed vertices in common, nor a boundary face that they

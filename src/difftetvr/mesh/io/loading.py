@@ -90,7 +90,7 @@ class _Tets:
 def load(
     path: str | Path, dtype: torch.dtype = torch.float32, *, split: bool = False, flat: Flat = "refuse"
 ) -> tuple[TetMesh, Field]:
-    """Reads a tetrahedral mesh with its field; :func:`load_mesh` reads the geometry of a file without one.
+    """Reads a tetrahedral mesh with its field; `load_mesh` reads the geometry of a file without one.
 
     Orientation is fixed by :class:`TetMesh`; vertices that no cell uses are dropped with their attributes; points,
     lines and polygons that lie beside the tetrahedra are left out. Colours and densities stored as integers are
@@ -116,7 +116,7 @@ def load(
 def load_with_optional_field(
     path: str | Path, dtype: torch.dtype = torch.float32, *, split: bool = False, flat: Flat = "refuse"
 ) -> tuple[TetMesh, Field | None]:
-    """Like :func:`load`, but gives None for the field of a file that holds no ``color`` and ``density``."""
+    """Like `load`, but gives None for the field of a file that holds no ``color`` and ``density``."""
     data, problem = _load(_Request(Path(path), dtype, split, flat))
     if problem is not None:
         raise problem
@@ -126,10 +126,10 @@ def load_with_optional_field(
 def load_mesh(
     path: str | Path, dtype: torch.dtype = torch.float32, *, split: bool = False, flat: Flat = "refuse"
 ) -> TetMesh:
-    """Reads the geometry alone, from any file that :func:`load` reads and from formats without attributes (.mesh).
+    """Reads the geometry alone, from any file that `load` reads and from formats without attributes (.mesh).
 
     Raises:
-        MeshError: As :func:`load`, except that no data arrays are needed.
+        MeshError: As `load`, except that no data arrays are needed.
     """
     return _load(_Request(Path(path), dtype, split, flat))[0].mesh
 
@@ -145,18 +145,18 @@ def load_data(
     """Reads a mesh with all data of its vertices and cells, such as the scalars of a simulation.
 
     Args:
-        path: As for :func:`load`.
+        path: As for `load`.
         dtype: Floating-point type of the mesh, its field and its data.
-        split: As for :func:`load`.
-        flat: As for :func:`load`.
-        require_field: Insist on ``color`` and ``density``, as :func:`load` does. Else arrays of these names that cannot
+        split: As for `load`.
+        flat: As for `load`.
+        require_field: Insist on ``color`` and ``density``, as `load` does. Else arrays of these names that cannot
             be rendered are data like any other, and a warning says so.
 
     Returns:
         The mesh, its data, and warnings.
 
     Raises:
-        MeshError: As :func:`load`.
+        MeshError: As `load`.
     """
     request = _Request(Path(path), dtype, split, flat)
     data, problem = _load(request)

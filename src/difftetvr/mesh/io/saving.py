@@ -67,7 +67,7 @@ def save(path: str | Path, mesh: TetMesh, field: Field | None = None) -> None:
 
 
 def require_writable_format(path: Path, with_field: bool = True) -> None:
-    """Checks that the suffix of a path names a format that :func:`save` writes.
+    """Checks that the suffix of a path names a format that `save` writes.
 
     Args:
         path: The file to write.

@@ -1,0 +1,1 @@
+"""What the manual needs of Sphinx besides its own extensions."""
