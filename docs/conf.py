@@ -25,6 +25,7 @@ extensions = [
     "extensions.code_links",
     "extensions.command_help",
     "extensions.docstrings",
+    "extensions.example_links",
 ]
 exclude_patterns = ["_build", "gallery/**/*.ipynb", "gallery/**/*.py", "gallery/**/*.json", "gallery/**/*.md5"]
 
@@ -84,6 +85,7 @@ sphinx_gallery_conf = {
 # ---- the pages
 
 html_theme = "furo"
+pygments_dark_style = "github-dark"
 html_title = "DiffTetVR for Python"
 html_static_path = ["_static"]
 html_css_files = ["manual.css"]

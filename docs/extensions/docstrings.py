@@ -27,8 +27,16 @@ def put_types_beside_names(app: Sphinx, what: str, name: str, item: Any, options
     lines[:] = "\n".join(lines).split("\n")
 
 
+def name_factories(
+    app: Sphinx, what: str, name: str, item: Any, options: Any, signature: str | None, returned: str | None
+) -> tuple[str | None, str | None]:
+    """A default that is made anew for each object has no value to be shown, and no syntax that could be read."""
+    return signature and signature.replace("<factory>", "..."), returned
+
+
 def setup(app: Sphinx) -> dict[str, bool]:
     """Tells Sphinx."""
     app.connect("autodoc-process-docstring", keep_description, priority=_BEFORE_NAPOLEON)
     app.connect("autodoc-process-docstring", put_types_beside_names, priority=_AFTER_NAPOLEON)
+    app.connect("autodoc-process-signature", name_factories)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
