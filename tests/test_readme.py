@@ -56,12 +56,6 @@ def test_extras_exist():
         assert re.search(rf"^{name} = \[", project, re.MULTILINE), name
 
 
-def test_links_into_the_project_lead_somewhere():
-    links = set(re.findall(r"\]\((?!https?:|#)([^)]+)\)", README))
-    assert links
-    assert not {link for link in links if not (ROOT / link).exists()}
-
-
 def test_no_placeholder_is_left_in_the_documents():
     documents = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")]
     assert not [document for document in documents if "@@" in document.read_text(encoding="utf-8")]

@@ -113,7 +113,7 @@ class Machine:
         for state in states:
             (self.state / state).unlink()
 
-    def setup(self, **environment: str) -> subprocess.CompletedProcess:
+    def setup(self, *what: str, **environment: str) -> subprocess.CompletedProcess:
         self.log.write_text("")
         environment = {
             "PATH": str(self.commands),
@@ -122,7 +122,7 @@ class Machine:
             "HOME": "",
         } | environment
         script = self.clone / "scripts" / "setup.sh"
-        return subprocess.run(["/bin/sh", script], env=environment, capture_output=True, text=True, cwd="/")
+        return subprocess.run(["/bin/sh", script, *what], env=environment, capture_output=True, text=True, cwd="/")
 
     @property
     def calls(self) -> list[str]:
@@ -158,6 +158,34 @@ def test_a_second_run_does_nothing(machine):
     machine.has("no-network")
     again = machine.setup()
     assert (again.returncode, again.stdout, again.stderr, machine.calls) == (0, "", "", [])
+
+
+def test_the_manual_is_set_up_only_where_it_is_asked_for(machine):
+    machine.has("llvm")
+    assert machine.setup().returncode == 0
+    assert not any("[docs]" in call for call in machine.calls)
+    assert machine.setup("docs").returncode == 0
+    installs = [call for call in machine.calls if "pip install" in call]
+    assert any(".[docs]" in call for call in installs) and not any(".[dev]" in call for call in installs)
+    machine.has("no-network")
+    again = machine.setup("docs")
+    assert (again.returncode, again.stdout, again.stderr, machine.calls) == (0, "", "", [])
+
+
+def test_from_scratch_the_manual_is_set_up_after_all_else(machine):
+    machine.has("llvm")
+    assert machine.setup("docs").returncode == 0 and machine.is_set_up
+    extras = [call[-6:] for call in machine.calls if "-e ." in call]
+    assert extras == [".[dev]", "[docs]"]
+    with (machine.clone / "pyproject.toml").open("a") as file:
+        file.write("# changed\n")
+    assert machine.setup().returncode == 0
+    assert machine.setup("docs").returncode == 0 and any("[docs]" in call for call in machine.calls)
+
+
+def test_only_what_there_is_can_be_set_up(machine):
+    done = machine.setup("dcos")
+    assert done.returncode != 0 and "there is no 'dcos'" in done.stderr and not machine.calls
 
 
 @pytest.mark.parametrize("changed", ["pyproject.toml", "requirements/lock.txt"])
