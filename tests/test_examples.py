@@ -27,6 +27,17 @@ def test_render_mesh(tmp_path):
     assert (tmp_path / "render_mesh.vtu").exists()
 
 
+def test_simulation(tmp_path):
+    output = run(str(ROOT / "examples" / "simulation.py"), str(tmp_path), folder=tmp_path)
+    assert re.search(r"'\+[\d.]*[1-9]", output)
+    assert (tmp_path / "simulation.png").stat().st_size > (tmp_path / "simulation_opened.png").stat().st_size > 10_000
+
+
+def test_tomography(tmp_path):
+    output = run(str(ROOT / "examples" / "tomography.py"), str(tmp_path), folder=tmp_path)
+    assert last_number(output, r"off by ([\d.]+) %") < 5.0
+
+
 def test_fit_volume(tmp_path):
     output = run(str(ROOT / "examples" / "fit_volume.py"), str(tmp_path), folder=tmp_path)
     assert last_number(output, r"PSNR ([\d.]+)") > 23.0

@@ -7,7 +7,15 @@ from typing import Any
 from sphinx_gallery.scrapers import figure_rst
 
 _OUTPUT = Path(__file__).resolve().parents[1] / "_build" / "examples"
-_ORDER = ["render_mesh", "simulation", "fit_volume", "fit_photos", "own_training_loop", "recover_pose"]
+_ORDER = [
+    "render_mesh",
+    "simulation",
+    "fit_volume",
+    "fit_photos",
+    "own_training_loop",
+    "recover_pose",
+    "tomography",
+]
 
 
 def output_folder(gallery_conf: dict[str, Any], script_vars: dict[str, Any]) -> list[str]:

@@ -37,7 +37,7 @@ _MOST_DOWNSCALE = 1024
 
 @dataclass(frozen=True)
 class PhotoCapture:
-    """Photographs with known cameras, in one of the formats of this field; docs/captures.md says which.
+    """Photographs with known cameras; "Photographs in" in the manual tells which formats are read, and how.
 
     Attributes:
         path: Folder, ``.json`` or ``.npz`` file.
