@@ -39,6 +39,7 @@ print(f"Held-out PSNR {result.metrics['psnr']:.2f} dB with {result.mesh.num_cell
 # A picture from where no camera was.
 
 middle = capture.bounds.mean(0)
-camera = dtv.Camera.look_at(middle + torch.tensor([0.6, -1.0, 0.5]), middle, (0, 0, 1), width=384, height=384)
+eye = middle + torch.tensor([0.6, -1.0, 0.5])
+camera = dtv.Camera.look_at(eye, target=middle, width=384, height=384)
 dtv.view.save_png(folder / "fit_photos.png", dtv.render(result.mesh, result.field, camera).color)
 dtv.save(folder / "fit_photos.vtu", result.mesh, result.field)

@@ -33,7 +33,8 @@ positions = VertexOptimizer(mesh, config)
 
 for step in range(STEPS + 1):
     view = step % len(capture.cameras)
-    image = dtv.render(positions.mesh, dtv.Field(color, capture.density_unit * density), capture.cameras[view]).color
+    field = dtv.Field(color, capture.density_unit * density)
+    image = dtv.render(positions.mesh, field, capture.cameras[view]).color
     loss = (image - capture.images[view]).square().mean()
     optimizer.zero_grad()
     loss.backward()
@@ -46,7 +47,8 @@ for step in range(STEPS + 1):
         positions.zero_grad()
     if step % 40 == 0:
         smallest = positions.mesh.volumes().min().item()
-        print(f"step {step:3d}  PSNR {-10 * torch.log10(loss).item():.2f} dB  smallest cell {smallest:.2e}")
+        psnr = -10 * torch.log10(loss).item()
+        print(f"step {step:3d}  PSNR {psnr:.2f} dB  smallest cell {smallest:.2e}")
 
 # %%
 # The last view beside its truth, and where the vertices went.

@@ -13,7 +13,6 @@ import difftetvr as dtv
 
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else "out/examples")
 folder.mkdir(parents=True, exist_ok=True)
-
 # %%
 # A photo of a known volume, taken from a place that is to be found.
 
@@ -56,5 +55,6 @@ for step in range(201):
 
 # %%
 # The photo beside the guess and beside what was found.
-rows = [("photo", photo, dtv.render(mesh, field, truth.with_pose(guess)).color, 1.0), ("photo", photo, image, 1.0)]
+first = dtv.render(mesh, field, truth.with_pose(guess)).color
+rows = [("photo", photo, first, 1.0), ("photo", photo, image, 1.0)]
 dtv.view.pictures.save_comparisons(folder / "recover_pose.png", rows)

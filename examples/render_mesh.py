@@ -38,7 +38,8 @@ field = dtv.Field(color, density)
 # %%
 # A camera, and the picture. ``image`` also holds ``alpha``, ``depth`` and ``optical_depth``.
 
-camera = dtv.Camera.look_at(eye=(2.2, -2.6, 1.6), target=(0, 0, 0), up=(0, 0, 1), fov_y=0.7, width=640, height=480)
+eye = (2.2, -2.6, 1.6)
+camera = dtv.Camera.look_at(eye, target=(0, 0, 0), fov_y=0.7, width=640, height=480)
 image = dtv.render(mesh, field, camera, background=(1.0, 1.0, 1.0))
 dtv.view.save_png(folder / "render_mesh.png", image.color)
 dtv.save(folder / "render_mesh.vtu", mesh, field)

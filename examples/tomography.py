@@ -43,7 +43,8 @@ for step in range(241):
     with torch.no_grad():
         density.clamp_(min=0.0)
     if step % 60 == 0:
-        print(f"step {step:3d}  density off by {100 * ((density - truth).norm() / truth.norm()).item():.1f} %")
+        error = (density.detach() - truth).norm() / truth.norm()
+        print(f"step {step:3d}  density off by {100 * error:.1f} %")
 
 # %%
 # An X-ray as it was measured, as it is found, and the difference; then a cut through the density.
@@ -52,6 +53,6 @@ with torch.no_grad():
     found = dtv.render(mesh, dtv.Field(black, density), cameras[0]).optical_depth
 pictures = [(depth / measured[0].max())[..., None].expand(-1, -1, 3) for depth in (measured[0], found)]
 dtv.view.pictures.save_comparisons(folder / "tomography.png", [("measured", *pictures, 1.0)])
-white = torch.ones(mesh.num_vertices, 3)
-cut = dtv.view.cut.cut_picture(mesh, dtv.Field(white, 4.0 * density.detach()), dtv.view.cut.Plane((0, -1, 0)), size=384)
+field = dtv.Field(torch.ones(mesh.num_vertices, 3), 4.0 * density.detach())
+cut = dtv.view.cut.cut_picture(mesh, field, dtv.view.cut.Plane((0, -1, 0)), size=384)
 cut.save(folder / "tomography_cut.png")

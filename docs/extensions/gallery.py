@@ -34,7 +34,8 @@ def scrape_pictures(block: Any, block_vars: dict[str, Any], gallery_conf: dict[s
             shown.touch()
             names.append(next(block_vars["image_path_iterator"]))
             shutil.copy(picture, names[-1])
-    return figure_rst(names, gallery_conf["src_dir"])
+    # One by one: several in a row would be too small to see anything.
+    return "\n".join(figure_rst([name], gallery_conf["src_dir"]) for name in names)
 
 
 class Order:
