@@ -57,3 +57,4 @@ rows = [(f"truth, view {view}", capture.images[view], image.detach(), 1.0)]
 dtv.view.pictures.save_comparisons(folder / "own_training_loop.png", rows)
 field = dtv.Field(color.detach(), capture.density_unit * density.detach())
 dtv.view.cut.cut_picture(positions.mesh, field, size=384).save(folder / "own_training_loop_cut.png")
+# sphinx_gallery_thumbnail_number = 2

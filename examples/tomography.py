@@ -56,3 +56,4 @@ dtv.view.pictures.save_comparisons(folder / "tomography.png", [("measured", *pic
 field = dtv.Field(torch.ones(mesh.num_vertices, 3), 4.0 * density.detach())
 cut = dtv.view.cut.cut_picture(mesh, field, dtv.view.cut.Plane((0, -1, 0)), size=384)
 cut.save(folder / "tomography_cut.png")
+# sphinx_gallery_thumbnail_number = 2

@@ -46,7 +46,7 @@ class RefinementRecord:
 
 @dataclass(frozen=True)
 class MoveTotals:
-    """Moves of vertices, summed over all steps (see `difftetvr.fitting.positions.StepReport`)."""
+    """Moves of vertices, summed over all steps (see `StepReport`)."""
 
     steps: int = 0
     moved: int = 0
