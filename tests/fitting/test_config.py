@@ -4,7 +4,8 @@ import json
 
 import pytest
 
-from difftetvr.fitting import FitConfig, FitError
+from difftetvr.errors import FitError
+from difftetvr.fitting import FitConfig
 from difftetvr.fitting.refinement import Exchange
 from difftetvr.mesh.making.generators import grid_cubes
 

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from difftetvr.capture import Capture
-from difftetvr.errors import BackendError, CaptureError
-from difftetvr.fitting import FitConfig, FitError, fit
+from difftetvr.errors import BackendError, CaptureError, FitError
+from difftetvr.fitting import FitConfig, fit
 from difftetvr.fitting.parameters import FieldParameters
 from difftetvr.fitting.records.checkpoint import Checkpoint
 from difftetvr.fitting.records.evaluation import evaluate, true_image
