@@ -130,6 +130,14 @@ def test_progress_draws_a_bar_on_a_terminal():
     assert "50/100" in console.export_text()
 
 
+def test_a_narrow_terminal_cuts_the_text_off_before_the_bar():
+    console = Console(width=80, record=True, force_terminal=True, file=open("/dev/null", "w"))  # noqa: SIM115
+    with ProgressDisplay(console) as display:
+        display(status(iteration=2, held_out_psnr=19.5, moves=MoveTotals(50, 9000, 3, 2, 1234)))
+    drawn = console.export_text().rpartition("starting")[2].splitlines()[0]
+    assert drawn.startswith("━" * 5) and "2/3" in drawn and len(drawn) <= 80
+
+
 @pytest.mark.parametrize("width", [80, 120])
 def test_a_terminal_shows_gains_and_the_time_left(width):
     console = Console(width=width, record=True, force_terminal=True, file=open("/dev/null", "w"))  # noqa: SIM115
