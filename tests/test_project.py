@@ -129,6 +129,17 @@ def test_rooms_are_small_and_say_what_they_answer():
         assert ast.get_docstring(ast.parse((room / "__init__.py").read_text())), f"{room} does not say what it answers"
 
 
+def test_the_table_of_changes_names_files_that_are_there():
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| .+ \| (`.+) \| (`.+) \|$", text, re.MULTILINE)
+    assert len(rows) >= 6
+    for place, other in rows:
+        assert len(re.findall(r"\w/[\w/.]*\.pyi?`", place)) == 1 and re.findall(r"[\w/]+\.pyi?`", other)
+        for path in re.findall(r"`((?:\w+/)+)([\w.]+\.pyi?)`", place + other):
+            file = PACKAGE / path[0] / path[1]
+            assert file.exists() or (file.name.startswith("...") and file.parent.is_dir()), file
+
+
 def test_only_kernels_and_their_wrappers_touch_drjit():
     users = {
         part_of(file)

@@ -7,7 +7,7 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, get_args
 
 import tyro
 from tyro.conf import OmitArgPrefixes, Positional, arg
@@ -16,7 +16,7 @@ from difftetvr.cli.help import Groups
 from difftetvr.cli.options import CAPTURE_GROUPS, CaptureOptions
 from difftetvr.cli.saved import SavedRun, saved_run
 from difftetvr.errors import FitError, counted
-from difftetvr.fitting.config import CHOSEN_FOR_CAPTURE, FitConfig
+from difftetvr.fitting.config import CHOSEN_FOR_CAPTURE, FitConfig, Refine
 from difftetvr.fitting.records.folder import RunFolder
 from difftetvr.terminal import waiting
 
@@ -53,7 +53,7 @@ class Fit:
         ),
         "Mesh": ("start", "grid", "initial-mesh", "repair", "location"),
         "Motion": ("move", "motion.*"),
-        "Refinement": ("refine", "exchange.*", "grow.*", "star.*"),
+        "Refinement": ("refine", *(f"{strategy}.*" for strategy in get_args(Refine))),
         "Optimisation": (
             *("loss", "harmonics", "harmonics-rate", "rate", "final-rate", "betas", "batch-views", "haze-penalty"),
             *("free-space", "sparsity", "initial-color", "initial-density", "seed", "deterministic"),
