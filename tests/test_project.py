@@ -193,3 +193,23 @@ def test_importing_the_package_asks_for_no_optional_package():
     environment = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_functions_hide_no_packages():
+    import pydoc
+
+    import difftetvr as dtv
+    import difftetvr.fitting.loop as loop
+
+    assert dtv.fit is loop.fit and dtv.rendering.render is dtv.render and callable(dtv.render)
+    assert dtv.fitting.VertexOptimizer is dtv.fitting.positions.VertexOptimizer
+    assert "Exchange" in dir(dtv.fitting.refinement)
+    assert "refined" in pydoc.render_doc(dtv.fitting.refinement)
+
+
+def test_everything_can_be_imported_at_once():
+    """Other packages ask for it in their tests, by a variable of the environment that all lazy packages heed."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT / "src"), "EAGER_IMPORT": "1"}
+    code = "import difftetvr, sys; print('difftetvr.fitting.trainer' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    assert done.stdout.strip() == "True", done.stderr
