@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-import functools
 import math
-import operator
 import types
 import typing
 import warnings
@@ -198,25 +197,48 @@ def parse(kind: type, name: str, args: Sequence[str], default: Any = None) -> An
     # With pairs (--move, --no-move) where options come from a file: it may say either, and arguments must turn it.
     settings = (FlagCreatePairsOff,) if default is None else ()
     registry = ConstructorRegistry()
-    registry.primitive_rule(_optional)
+    registry.primitive_rule(_union)
     return tyro.cli(kind, prog=f"difftetvr {name}", args=args, default=default, config=settings, registry=registry)
 
 
-def _optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | UnsupportedTypeAnnotationError | None:
-    """A value of a type, or None, with which options that a file gives are left open again; help omits it."""
-    parts = typing.get_args(info.type)
-    if info.type_origin not in (typing.Union, types.UnionType) or types.NoneType not in parts:
+def _union(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | UnsupportedTypeAnnotationError | None:
+    """A value of one of several types, plainly described.
+
+    None, with which options that a file gives are left open again, is taken but not mentioned.
+    """
+    if info.type_origin not in (typing.Union, types.UnionType):
         return None
-    inner: Any = functools.reduce(operator.or_, (part for part in parts if part is not types.NoneType))
-    spec = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(inner, info.markers))
-    if not isinstance(spec, PrimitiveConstructorSpec):
-        return spec
-    counts = {1, *(spec.nargs if isinstance(spec.nargs, tuple) else (spec.nargs,))}
-    return dataclasses.replace(
-        spec,
-        nargs="*" if "*" in counts else 1 if counts == {1} else tuple(sorted(counts)),
-        instance_from_str=lambda words: None if words == [_NONE] else spec.instance_from_str(words),
-        is_instance=lambda value: value is None or spec.is_instance(value),
-        str_from_instance=lambda value: [_NONE] if value is None else spec.str_from_instance(value),
-        choices=None if spec.choices is None else (*spec.choices, _NONE),
+    specs = []
+    for part in typing.get_args(info.type):
+        spec = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(part, info.markers))
+        if not isinstance(spec, PrimitiveConstructorSpec):
+            return spec
+        specs.append(spec)
+    metavar = "|".join(spec.metavar.strip("{}").replace(",", "|") for spec in specs if spec.choices != (_NONE,))
+
+    def value_of(words: list[str]) -> Any:
+        for spec in specs:
+            with contextlib.suppress(ValueError):
+                if _fits(words, spec):
+                    return spec.instance_from_str(words)
+        raise ValueError(f"give {metavar}, not '{' '.join(words)}'")
+
+    def spec_of(value: Any) -> PrimitiveConstructorSpec[Any]:
+        return next(spec for spec in specs if spec.is_instance(value))
+
+    counts = {count for spec in specs for count in (spec.nargs if isinstance(spec.nargs, tuple) else [spec.nargs])}
+    numbers = sorted(count for count in counts if count != "*")
+    return PrimitiveConstructorSpec(
+        nargs="*" if "*" in counts else numbers[0] if len(numbers) == 1 else tuple(numbers),
+        metavar=metavar,
+        instance_from_str=value_of,
+        is_instance=lambda value: any(spec.is_instance(value) for spec in specs),
+        str_from_instance=lambda value: spec_of(value).str_from_instance(value),
+        choices=sum((spec.choices or () for spec in specs), ()) if all(spec.choices for spec in specs) else None,
     )
+
+
+def _fits(words: list[str], spec: PrimitiveConstructorSpec[Any]) -> bool:
+    """Whether words can be a value, by their number and the choices there are."""
+    counts = spec.nargs if isinstance(spec.nargs, tuple) else (spec.nargs,)
+    return (len(words) in counts or "*" in counts) and (spec.choices is None or set(words) <= set(spec.choices))
