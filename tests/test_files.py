@@ -1,7 +1,6 @@
 """Files appear whole or not at all."""
 
 import os
-import resource
 import shutil
 import stat
 import subprocess
@@ -12,6 +11,8 @@ import pytest
 
 from difftetvr.errors import CaptureError, DiffTetError, MeshError
 from difftetvr.files import atomic_write, require_writable, require_writable_folder
+
+posix = pytest.mark.skipif(os.name != "posix", reason="permissions, limits and the words of errors are those of POSIX")
 
 
 def names(folder: Path) -> list[str]:
@@ -56,6 +57,7 @@ def test_a_body_that_removes_its_file_is_an_error_and_keeps_the_old_one(tmp_path
     assert target.read_text() == "old"
 
 
+@posix
 def test_permissions_are_those_of_the_replaced_file_or_of_a_new_one(tmp_path):
     previous = os.umask(0o027)
     try:
@@ -101,6 +103,7 @@ def fail_on_long_name(folder: Path) -> Path:
     return folder / ("x" * 300 + ".png")
 
 
+@posix
 @pytest.mark.parametrize(
     ("bad_target", "reason", "advice"),
     [
@@ -121,6 +124,7 @@ def test_impossible_targets_give_one_sentence_of_the_given_kind(tmp_path, bad_ta
     assert os.path.exists(os.devnull) and not os.path.isfile(os.devnull)
 
 
+@posix
 @pytest.mark.parametrize(
     "bad_target", [fail_in_missing_folder, fail_on_folder, fail_below_file, fail_on_device, fail_on_long_name]
 )
@@ -145,6 +149,7 @@ def test_the_check_leaves_possible_targets_as_they_are(tmp_path):
     assert (tmp_path / "old.json").read_text() == "old"
 
 
+@posix
 def test_folders_that_cannot_be(tmp_path):
     (tmp_path / "file").write_text("")
     for folder in (tmp_path / "file", tmp_path / "file" / "a" / "b", Path("/proc/a/b")):
@@ -168,6 +173,7 @@ def test_a_full_disk_met_in_the_body(tmp_path):
 
 
 def test_a_limit_on_file_sizes_met_in_the_body(tmp_path):
+    resource = pytest.importorskip("resource")
     target = tmp_path / "a.vtu"
     target.write_text("old")
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -209,6 +215,7 @@ def test_a_disk_that_is_really_full(tmp_path):
 
 def test_a_body_that_does_not_know_why_it_failed(tmp_path):
     """numpy's tofile says how much it wrote of how much, but not what stopped it."""
+    resource = pytest.importorskip("resource")
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
     try:

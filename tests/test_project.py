@@ -129,6 +129,17 @@ def test_rooms_are_small_and_say_what_they_answer():
         assert ast.get_docstring(ast.parse((room / "__init__.py").read_text())), f"{room} does not say what it answers"
 
 
+def test_the_table_of_changes_names_files_that_are_there():
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| .+ \| (`.+) \| (`.+) \|$", text, re.MULTILINE)
+    assert len(rows) >= 6
+    for place, other in rows:
+        assert len(re.findall(r"\w/[\w/.]*\.pyi?`", place)) == 1 and re.findall(r"[\w/]+\.pyi?`", other)
+        for path in re.findall(r"`((?:\w+/)+)([\w.]+\.pyi?)`", place + other):
+            file = PACKAGE / path[0] / path[1]
+            assert file.exists() or (file.name.startswith("...") and file.parent.is_dir()), file
+
+
 def test_only_kernels_and_their_wrappers_touch_drjit():
     users = {
         part_of(file)
@@ -182,3 +193,23 @@ def test_importing_the_package_asks_for_no_optional_package():
     environment = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_functions_hide_no_packages():
+    import pydoc
+
+    import difftetvr as dtv
+    import difftetvr.fitting.loop as loop
+
+    assert dtv.fit is loop.fit and dtv.rendering.render is dtv.render and callable(dtv.render)
+    assert dtv.fitting.VertexOptimizer is dtv.fitting.positions.VertexOptimizer
+    assert "Exchange" in dir(dtv.fitting.refinement)
+    assert "refined" in pydoc.render_doc(dtv.fitting.refinement)
+
+
+def test_everything_can_be_imported_at_once():
+    """Other packages ask for it in their tests, by a variable of the environment that all lazy packages heed."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT / "src"), "EAGER_IMPORT": "1"}
+    code = "import difftetvr, sys; print('difftetvr.fitting.trainer' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    assert done.stdout.strip() == "True", done.stderr

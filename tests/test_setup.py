@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.skipif(os.name != "posix", reason="setup.sh and its stand-ins need a POSIX shell")
+
 ROOT = Path(__file__).parents[1]
 TOOLS = [
     "awk",

@@ -7,6 +7,7 @@ and Metal, in float32 and float64. Only kernel modules and the modules that wrap
 from __future__ import annotations
 
 import importlib
+import os
 import platform
 import threading
 from collections.abc import Iterator
@@ -18,7 +19,7 @@ from typing import Any
 import torch
 
 from difftetvr.errors import BackendError
-from difftetvr.libllvm import tell_drjit
+from difftetvr.libllvm import PATH_VARIABLE, tell_drjit
 
 tell_drjit()  # before the first import of Dr.Jit, which looks for libLLVM only then
 
@@ -182,6 +183,50 @@ def default_device() -> torch.device:
         except BackendError:
             continue
     raise BackendError(_missing_backend("llvm"))
+
+
+@dataclass(frozen=True)
+class BackendState:
+    """Whether a back end starts here, and on what it runs.
+
+    Attributes:
+        name: ``"llvm"``, ``"cuda"`` or ``"metal"``.
+        device: PyTorch device that it works on.
+        works: Whether it starts.
+        text: Libraries, versions, threads and memory; or what keeps it from starting.
+        has_doubles: Whether it computes in float64.
+    """
+
+    name: str
+    device: str
+    works: bool
+    text: str
+    has_doubles: bool
+
+
+def backend_states() -> list[BackendState]:
+    """All back ends, the CPU's first, each with what can be said of it; for bug reports."""
+    states = []
+    for device, name in _DEVICE_BACKENDS.items():
+        try:
+            get_backend(device)
+            works, text = True, _description(name)
+        except BackendError as error:
+            works, text = False, str(error)
+        states.append(BackendState(name, device, works, text, works and name != "metal"))
+    return states
+
+
+def _description(name: str) -> str:
+    if name == "llvm":
+        version = ".".join(str(number) for number in dr.detail.llvm_version())
+        library = os.environ.get(PATH_VARIABLE, "found by Dr.Jit itself")
+        return f"LLVM {version} ({library}), {dr.thread_count()} threads; PyTorch has {torch.get_num_threads()}"
+    if name == "cuda":
+        free, total = (amount / 2**30 for amount in torch.cuda.mem_get_info())
+        version = f"CUDA {torch.version.cuda} in PyTorch, driver for {dr.detail.cuda_version()}"
+        return f"{torch.cuda.get_device_name()}, {version}, {free:.1f} of {total:.1f} GiB free"
+    return "the system's Metal"
 
 
 def _missing_backend(name: str) -> str:

@@ -7,13 +7,15 @@ import errno
 import io
 import re
 import sys
+import threading
+from collections.abc import Iterator
 
 from rich.console import Console
-from rich.status import Status
 from rich.text import Text
 
 from difftetvr.errors import DiffTetError
 
+_LONG_SECONDS = 3.0
 _NO_MEMORY = "There is not enough memory; use fewer cells, or fewer or smaller views."
 # Torch's and Dr.Jit's allocators raise RuntimeErrors like any others; only their words tell them apart.
 _ALLOCATION = re.compile(
@@ -34,15 +36,28 @@ def console() -> Console:
     return Console(markup=False, emoji=False, highlight=False, soft_wrap=True)
 
 
-def waiting(console: Console, text: str) -> Status:
-    """A text beside something that turns, while something else takes its time.
+@contextlib.contextmanager
+def waiting(console: Console, text: str) -> Iterator[None]:
+    """Says what is going on while something takes its time.
+
+    On a terminal the text stands beside something that turns; elsewhere it becomes a line if it takes long.
 
     Args:
         console: Where to show it.
         text: Shown as it is.
     """
-    spinner = "dots" if console.encoding.startswith("utf") else "line"
-    return console.status(Text(text), spinner=spinner)
+    if console.is_terminal:
+        spinner = "dots" if console.encoding.startswith("utf") else "line"
+        with console.status(Text(text), spinner=spinner):
+            yield
+        return
+    line = threading.Timer(_LONG_SECONDS, lambda: console.print(f"{text} ...", highlight=False))
+    line.daemon = True
+    line.start()
+    try:
+        yield
+    finally:
+        line.cancel()
 
 
 def sentence_for(error: Exception) -> str | None:

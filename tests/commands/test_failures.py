@@ -21,7 +21,7 @@ def test_outputs_that_cannot_be_written_are_found_before_the_work(run, tmp_path,
     def work(*args, **kwargs):
         pytest.fail("the work has begun")
 
-    monkeypatch.setattr(cli.CaptureOptions, "load", work)
+    monkeypatch.setattr("difftetvr.cli.options.CaptureOptions.load", work)
     monkeypatch.setattr("difftetvr.mesh.io.load", work)
     missing, file = tmp_path / "missing", tmp_path / "file"
     file.write_text("")

@@ -21,7 +21,7 @@ def written(path, content):
 def parsed(*args):
     """The command that the program would run."""
     command = [str(a) for a in args]
-    return cli.parse(cli.Command, command, cli.Fit.defaults(command[1:]))
+    return cli.parse_command(command)
 
 
 @pytest.fixture
@@ -160,6 +160,6 @@ def test_resuming_takes_flags_again_that_the_run_was_started_with(tmp_path):
 def test_help_tells_of_the_file_and_shows_its_values(still, capsys):
     assert cli.main(["fit", "--help"]) == 0
     shown = capsys.readouterr().out
-    assert "--config {None}|PATH" in shown and "options-file" not in shown and "--no-move " in shown
+    assert "--config FILE" in shown and "{None}" not in shown and "options-file" not in shown and "--no-move " in shown
     assert cli.main(["fit", "--config", str(still), "--help"]) == 0
     assert "--move, --no-move" in capsys.readouterr().out

@@ -1,14 +1,25 @@
 """Options, schedules and the choice of the grid."""
 
 import json
+from typing import get_args
 
 import pytest
 
-from difftetvr.fitting import FitConfig, FitError
+from difftetvr.errors import FitError
+from difftetvr.fitting import FitConfig
+from difftetvr.fitting.config import LossName, Refine
+from difftetvr.fitting.losses import LOSSES
 from difftetvr.fitting.refinement import Exchange
 from difftetvr.mesh.making.generators import grid_cubes
 
 TOOTH = (103, 94, 161)
+
+
+def test_options_name_every_loss_and_every_strategy():
+    assert set(get_args(LossName)) == set(LOSSES)
+    options = FitConfig()
+    for name in set(get_args(Refine)) - {"none"}:
+        assert FitConfig(refine=name).strategy() == getattr(options, name)
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import os
 import re
 import signal
 
@@ -10,8 +9,8 @@ import pytest
 import torch
 
 from difftetvr.capture import Capture
-from difftetvr.errors import BackendError, CaptureError
-from difftetvr.fitting import FitConfig, FitError, fit
+from difftetvr.errors import BackendError, CaptureError, FitError
+from difftetvr.fitting import FitConfig, fit
 from difftetvr.fitting.parameters import FieldParameters
 from difftetvr.fitting.records.checkpoint import Checkpoint
 from difftetvr.fitting.records.evaluation import evaluate, true_image
@@ -68,7 +67,7 @@ def test_interrupted_run_goes_on_to_the_same_result(small_capture, reference, tm
 
     def interrupt(progress):
         if progress.iteration == 13:
-            os.kill(os.getpid(), signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
 
     with pytest.raises(KeyboardInterrupt):
         fit(small_capture, SMALL, checkpoint=path, on_progress=interrupt)

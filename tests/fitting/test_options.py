@@ -5,8 +5,8 @@ import typing
 
 import pytest
 
-from difftetvr.errors import counted
-from difftetvr.fitting import FitConfig, FitError
+from difftetvr.errors import FitError, counted
+from difftetvr.fitting import FitConfig
 from difftetvr.fitting.motion import Motion, VertexOptimizerConfig
 from difftetvr.fitting.options import OptionGroup
 

@@ -1,5 +1,7 @@
 """Pictures, plots and tables."""
 
+import os
+
 import numpy as np
 import pytest
 import torch
@@ -18,7 +20,7 @@ from difftetvr.view.plots import save_curves
 
 
 def text_of(*renderables):
-    console = Console(width=100, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
+    console = Console(width=100, record=True, file=open(os.devnull, "w"))  # noqa: SIM115
     for renderable in renderables:
         console.print(renderable)
     return console.export_text()
@@ -113,7 +115,7 @@ def status(**changes):
 
 
 def test_progress_prints_plain_lines_where_there_is_no_terminal():
-    console = Console(width=60, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
+    console = Console(width=60, record=True, file=open(os.devnull, "w"))  # noqa: SIM115
     with ProgressDisplay(console) as display:
         for i in (1, 2, 3):
             display(status(iteration=i, held_out_psnr=19.5 if i > 1 else None))
@@ -124,15 +126,23 @@ def test_progress_prints_plain_lines_where_there_is_no_terminal():
 
 
 def test_progress_draws_a_bar_on_a_terminal():
-    console = Console(width=160, record=True, force_terminal=True, file=open("/dev/null", "w"))  # noqa: SIM115
+    console = Console(width=160, record=True, force_terminal=True, file=open(os.devnull, "w"))  # noqa: SIM115
     with ProgressDisplay(console) as display:
         display(status(iteration=50, iterations=100))
     assert "50/100" in console.export_text()
 
 
+def test_a_narrow_terminal_cuts_the_text_off_before_the_bar():
+    console = Console(width=80, record=True, force_terminal=True, file=open("/dev/null", "w"))  # noqa: SIM115
+    with ProgressDisplay(console) as display:
+        display(status(iteration=2, held_out_psnr=19.5, moves=MoveTotals(50, 9000, 3, 2, 1234)))
+    drawn = console.export_text().rpartition("starting")[2].splitlines()[0]
+    assert drawn.startswith("━" * 5) and "2/3" in drawn and len(drawn) <= 80
+
+
 @pytest.mark.parametrize("width", [80, 120])
 def test_a_terminal_shows_gains_and_the_time_left(width):
-    console = Console(width=width, record=True, force_terminal=True, file=open("/dev/null", "w"))  # noqa: SIM115
+    console = Console(width=width, record=True, force_terminal=True, file=open(os.devnull, "w"))  # noqa: SIM115
     record = RefinementRecord(100, 12000, 12345, 2000, 70, 80, 5, 3e-4, 2e-3, 1.8e-3)
     with ProgressDisplay(console) as display:
         display(status(iteration=1000, iterations=2400, refinements=3))
@@ -152,7 +162,7 @@ def test_a_terminal_shows_gains_and_the_time_left(width):
 
 
 def test_progress_tells_of_moves_and_refinements():
-    console = Console(width=60, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
+    console = Console(width=60, record=True, file=open(os.devnull, "w"))  # noqa: SIM115
     record = RefinementRecord(100, 12000, 12345, 2000, 70, 80, 5, 3e-4, 2e-3, 1.8e-3)
     with ProgressDisplay(console) as display:
         display(status(refinements=3))

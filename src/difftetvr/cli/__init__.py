@@ -1,36 +1,68 @@
-"""The command line: ``difftetvr fit | mesh | render | compare | cut | eval | info | export``."""
+"""The command line: ``difftetvr fit | mesh | render | compare | cut | eval | info | export | doctor``.
+
+PyTorch takes seconds to import, so only a command that runs does it: help, versions and mistyped arguments do not.
+"""
 
 from __future__ import annotations
 
+import difflib
+import importlib
 import sys
 from collections.abc import Sequence
-from typing import Annotated, Any
+from typing import Any
 
-from tyro.conf import subcommand
+from difftetvr._version import __version__
+from difftetvr.cli.options import parse
+from difftetvr.errors import FitError
+from difftetvr.terminal import console, sentence_for, waiting
 
-from difftetvr.cli.files import Eval, Export, Info
-from difftetvr.cli.fit import Fit
-from difftetvr.cli.mesh import Mesh
-from difftetvr.cli.options import CaptureOptions, parse
-from difftetvr.cli.pictures import Compare, Cut
-from difftetvr.cli.render import Render
-from difftetvr.terminal import console, sentence_for
-
-__all__ = ["CaptureOptions", "Compare", "Cut", "Eval", "Export", "Fit", "Info", "Mesh", "Render", "main"]
+__all__ = ["COMMANDS", "command_type", "main", "parse_command"]
 
 _USAGE_ERROR = 2
 _INTERRUPTED = 130
+_HELP = ("-h", "--help")
 
-Command = (
-    Annotated[Fit, subcommand("fit")]
-    | Annotated[Mesh, subcommand("mesh")]
-    | Annotated[Render, subcommand("render")]
-    | Annotated[Compare, subcommand("compare")]
-    | Annotated[Cut, subcommand("cut")]
-    | Annotated[Eval, subcommand("eval")]
-    | Annotated[Info, subcommand("info")]
-    | Annotated[Export, subcommand("export")]
-)
+COMMANDS = {
+    "fit": "fit.Fit",
+    "mesh": "mesh.Mesh",
+    "render": "render.Render",
+    "compare": "pictures.Compare",
+    "cut": "pictures.Cut",
+    "eval": "files.Eval",
+    "info": "files.Info",
+    "export": "files.Export",
+    "doctor": "doctor.Doctor",
+}
+"""Modules and dataclasses of the commands, within this package."""
+
+
+def command_type(name: str) -> type:
+    """The dataclass of a command.
+
+    Raises:
+        FitError: There is no such command.
+    """
+    if name not in COMMANDS:
+        alike = difflib.get_close_matches(name, COMMANDS, 1)
+        hint = f"; is it '{alike[0]}'?" if alike else f"; give one of {', '.join(COMMANDS)}."
+        raise FitError(f"There is no command '{name}'{hint}")
+    module, _, kind = COMMANDS[name].partition(".")
+    found: type = getattr(importlib.import_module(f"difftetvr.cli.{module}"), kind)
+    return found
+
+
+def parse_command(args: Sequence[str]) -> Any:
+    """The command that arguments describe, ready to run.
+
+    Args:
+        args: Arguments after the program's name.
+
+    Raises:
+        FitError: There is no such command, or a file that options come from cannot be read.
+        SystemExit: An argument is not valid; what is wrong with it has been printed.
+    """
+    kind: Any = command_type(args[0])
+    return parse(kind, args[0], args[1:], _saved(kind, args[1:]))
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -44,8 +76,13 @@ def main(args: Sequence[str] | None = None) -> int:
     """
     given = list(sys.argv[1:] if args is None else args)
     try:
-        command: Any = parse(Command, given, Fit.defaults(given[1:]) if given[:1] == ["fit"] else None)
-        command.run(console())
+        if _tell(given):
+            return 0 if given else _USAGE_ERROR
+        command, out = parse_command(given), console()
+        if out.is_terminal:
+            with waiting(out, "Loading PyTorch"):
+                importlib.import_module("torch")
+        command.run(out)
     except SystemExit as leave:
         return leave.code if isinstance(leave.code, int) else _USAGE_ERROR
     except KeyboardInterrupt:
@@ -57,3 +94,25 @@ def main(args: Sequence[str] | None = None) -> int:
         print(f"difftetvr: {sentence}", file=sys.stderr)
         return _USAGE_ERROR
     return 0
+
+
+def _tell(given: Sequence[str]) -> bool:
+    """Prints what arguments ask to be told without running anything; whether they did, as no arguments do."""
+    from difftetvr.cli.help import print_help, print_overview
+
+    if given[:1] == ["--version"]:
+        print(f"difftetvr {__version__}")
+    elif not given or given[0] in _HELP:
+        print_overview(console(), {name: command_type(name) for name in COMMANDS})
+    elif any(word in _HELP for word in given[1:]):
+        kind = command_type(given[0])
+        asked = [word for word in given[1:] if word not in _HELP]
+        print_help(console(), given[0], kind, _saved(kind, asked))
+    else:
+        return False
+    return True
+
+
+def _saved(kind: Any, args: Sequence[str]) -> Any:
+    """What stands for options that are not given, where a command takes them from a file."""
+    return kind.defaults(args) if hasattr(kind, "defaults") else None

@@ -5,11 +5,12 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from difftetvr.cli.options import CaptureOptions, MeshOptions, load_model
+from difftetvr.cli.help import Groups
+from difftetvr.cli.options import CAPTURE_GROUPS, CaptureOptions, Color, MeshOptions, color_of, load_model
 from difftetvr.errors import FitError, MeshError, counted
 from difftetvr.files import require_writable
 from difftetvr.fitting.records.folder import write_json
@@ -31,11 +32,12 @@ class Eval:
     """File to write the numbers to, JSON."""
     all_views: bool = False
     """Compare with the training views, too."""
-    background: tuple[float, float, float] | None = None
-    """R G B behind the volume; default: white for photographs that alpha cuts out, else black."""
+    background: Color | None = None
+    """Behind the volume: black, white or R G B; default: white for photographs that alpha cuts out, else black."""
     device: str | None = None
     """Where to render."""
     views_of: OmitArgPrefixes[CaptureOptions] = field(default_factory=CaptureOptions)
+    groups: ClassVar[Groups] = CAPTURE_GROUPS
 
     def run(self, console: Console) -> None:
         """Renders the views and prints PSNR and SSIM of each."""
@@ -44,9 +46,10 @@ class Eval:
 
         if self.output is not None:
             require_writable(self.output, FitError)
+        given = None if self.background is None else color_of(self.background)
         mesh, field_on_mesh = load_model(self.model, self.device)
         capture = self.views_of.sized_for(self.capture, self.device, console).load(self.capture, console)
-        background = usual_background(capture) if self.background is None else self.background
+        background = usual_background(capture) if given is None else given
         views = list(range(len(capture.cameras))) if self.all_views else capture.test_indices.tolist()
         if not views:
             raise FitError(f"'{capture.name}' holds out no views; compare with all of them with --all-views.")
@@ -64,6 +67,7 @@ class Info:
     """A mesh (.vtu, .vtk, .msh, .mesh, .xdmf, .npz, .bintet, .ovm, .node), a volume, a capture (.npz), or tooth."""
     reading: OmitArgPrefixes[MeshOptions] = field(default_factory=MeshOptions)
     views_of: OmitArgPrefixes[CaptureOptions] = field(default_factory=CaptureOptions)
+    groups: ClassVar[Groups] = CAPTURE_GROUPS
 
     def run(self, console: Console) -> None:
         """Prints tables."""

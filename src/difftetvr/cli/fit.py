@@ -7,16 +7,18 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, get_args
 
 import tyro
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from difftetvr.cli.options import CaptureOptions, Output
+from difftetvr.cli.help import Groups
+from difftetvr.cli.options import CAPTURE_GROUPS, CaptureOptions
 from difftetvr.cli.saved import SavedRun, saved_run
 from difftetvr.errors import FitError, counted
-from difftetvr.fitting.config import CHOSEN_FOR_CAPTURE, FitConfig
+from difftetvr.fitting.config import CHOSEN_FOR_CAPTURE, FitConfig, Refine
 from difftetvr.fitting.records.folder import RunFolder
+from difftetvr.terminal import waiting
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -33,7 +35,7 @@ class Fit:
     """What to fit: tooth (the built-in CT scan), or the path of a volume, of photographs with their cameras
     (NeRF-synthetic, transforms.json, COLMAP, cameras.json), or of a saved capture (.npz). May be left out where
     --config names it."""
-    output: Output
+    output: Annotated[Path, arg(aliases=["-o"], metavar="OUT")]
     """Folder for the model, its metrics, pictures and checkpoint."""
     config: Annotated[FitConfig, arg(name="")] = field(default_factory=FitConfig)
     views_of: OmitArgPrefixes[CaptureOptions] = field(default_factory=CaptureOptions)
@@ -44,6 +46,21 @@ class Fit:
     """Go on with the run in the output folder; options that are not given are taken from it."""
     overwrite: bool = False
     """Replace the run in the output folder."""
+    groups: ClassVar[Groups] = {
+        "Most used": (
+            *("output", "cells", "iterations", "downscale", "transfer-function"),
+            *("background", "device", "config", "resume", "overwrite"),
+        ),
+        "Mesh": ("start", "grid", "initial-mesh", "repair", "location"),
+        "Motion": ("move", "motion.*"),
+        "Refinement": ("refine", *(f"{strategy}.*" for strategy in get_args(Refine))),
+        "Optimisation": (
+            *("loss", "harmonics", "harmonics-rate", "rate", "final-rate", "betas", "batch-views", "haze-penalty"),
+            *("free-space", "sparsity", "initial-color", "initial-density", "seed", "deterministic"),
+        ),
+        **CAPTURE_GROUPS,
+        "Output": ("evaluate-every", "checkpoint-seconds"),
+    }
 
     def run(self, console: Console) -> None:
         """Fits, and fills the output folder."""
@@ -55,7 +72,8 @@ class Fit:
         folder.require_free(resume=self.resume, overwrite=self.overwrite)
         views_of = self.views_of.sized_for(self.capture, self.config.device, console)
         capture = views_of.load(self.capture, console)
-        trainer = prepare(capture, self.config, resume_from=folder.checkpoint if self.resume else None)
+        with waiting(console, "Reading the checkpoint" if self.resume else "Making the mesh to begin with"):
+            trainer = prepare(capture, self.config, resume_from=folder.checkpoint if self.resume else None)
         chosen = dataclasses.replace(self, config=trainer.config, views_of=views_of)
         if capture.encoding == "srgb":
             _print_choices(console, self.config, trainer.config)
@@ -65,7 +83,8 @@ class Fit:
         options = chosen.to_json() | ({"repair": trainer.repair} if trainer.repair else {})
         with folder.occupied(options, overwrite=self.overwrite, begun=lambda: trainer.iteration > 0):
             result = self._optimise(trainer, folder, console)
-        write_report(folder, result, capture)
+        with waiting(console, f"Drawing pictures into {self.output}"):
+            write_report(folder, result, capture)
         _print_summary(console, result.metrics, folder)
 
     def _optimise(self, trainer: Trainer, folder: RunFolder, console: Console) -> FitResult:

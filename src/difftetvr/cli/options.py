@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import math
+import types
+import typing
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,7 +15,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 from tyro.conf import FlagCreatePairsOff, arg
+from tyro.constructors import (
+    ConstructorRegistry,
+    PrimitiveConstructorSpec,
+    PrimitiveTypeInfo,
+    UnsupportedTypeAnnotationError,
+)
 
+from difftetvr.cli.help import Groups
+from difftetvr.errors import CaptureError
 from difftetvr.terminal import waiting
 
 if TYPE_CHECKING:
@@ -26,6 +38,21 @@ if TYPE_CHECKING:
 _LONGEST_SIDE, _LONGEST_SIDE_ON_CUDA = 240, 1600
 
 Output = Annotated[Path, arg(aliases=["-o"])]
+
+Color = Literal["black", "white"] | tuple[float, float, float]
+"""Of a background: its name, or R G B as the picture's are, linear or sRGB-encoded."""
+
+_NONE = "None"
+_COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+
+CAPTURE_GROUPS: Groups = {
+    "How photographs are read": ("downscale", "format", "bounds", "test-every"),
+    "How a volume is read and seen": (
+        *("transfer-function", "shape", "dtype", "spacing", "attenuation"),
+        *("views", "width", "height", "radius", "orbit"),
+    ),
+}
+"""Where `CaptureOptions` stand in the help of a command."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +107,8 @@ class CaptureOptions:
             # They are said when the images are read.
             warnings.simplefilter("ignore", CaptureWarning)
             longest_side = _LONGEST_SIDE_ON_CUDA if resolve_device(device).type == "cuda" else _LONGEST_SIDE
-            downscale = PhotoCapture(name, self.format).fitting_downscale(longest_side)
+            with waiting(console, f"Looking at the images of {name}"):
+                downscale = PhotoCapture(name, self.format).fitting_downscale(longest_side)
         if downscale > 1:
             console.print(f"Chosen for this machine: --downscale {downscale}", highlight=False)
         return dataclasses.replace(self, downscale=downscale)
@@ -122,6 +150,19 @@ class MeshOptions:
         return data
 
 
+def color_of(background: Color) -> tuple[float, float, float]:
+    """R G B of a background.
+
+    Raises:
+        CaptureError: It is not finite.
+    """
+    rgb = _COLORS[background] if isinstance(background, str) else background
+    if not all(math.isfinite(value) for value in rgb):
+        given = " ".join(f"{value:g}" for value in rgb)
+        raise CaptureError(f"--background is {given}; give black, white or three finite numbers.")
+    return rgb
+
+
 def load_model(
     path: Path, device: str | None, options: MeshOptions | None = None, console: Console | None = None
 ) -> tuple[TetMesh, Field]:
@@ -141,15 +182,63 @@ def load_model(
     return data.mesh.to(device=target), data.field.to(device=target)
 
 
-def parse(command: Any, args: Sequence[str], default: Any = None) -> Any:
+def parse(kind: type, name: str, args: Sequence[str], default: Any = None) -> Any:
     """A command from arguments.
 
     Args:
-        command: Its type, or a union of such types.
-        args: The arguments.
+        kind: Its dataclass.
+        name: What it is called on the command line.
+        args: The arguments after that.
         default: Holds the values of options that are not given, ``tyro.MISSING`` where they must be; None: as declared.
+
+    Raises:
+        SystemExit: An argument is not valid; what is wrong with it has been printed.
     """
-    if default is None:
-        return tyro.cli(command, prog="difftetvr", args=args, config=(FlagCreatePairsOff,))
-    # With pairs (--move, --no-move): such a default may stand either way, and the arguments must be able to turn it.
-    return tyro.cli(command, prog="difftetvr", args=args, default=default)
+    # With pairs (--move, --no-move) where options come from a file: it may say either, and arguments must turn it.
+    settings = (FlagCreatePairsOff,) if default is None else ()
+    registry = ConstructorRegistry()
+    registry.primitive_rule(_union)
+    return tyro.cli(kind, prog=f"difftetvr {name}", args=args, default=default, config=settings, registry=registry)
+
+
+def _union(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | UnsupportedTypeAnnotationError | None:
+    """A value of one of several types, plainly described.
+
+    None, with which options that a file gives are left open again, is taken but not mentioned.
+    """
+    if info.type_origin not in (typing.Union, types.UnionType):
+        return None
+    specs = []
+    for part in typing.get_args(info.type):
+        spec = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(part, info.markers))
+        if not isinstance(spec, PrimitiveConstructorSpec):
+            return spec
+        specs.append(spec)
+    metavar = "|".join(spec.metavar.strip("{}").replace(",", "|") for spec in specs if spec.choices != (_NONE,))
+
+    def value_of(words: list[str]) -> Any:
+        for spec in specs:
+            with contextlib.suppress(ValueError):
+                if _fits(words, spec):
+                    return spec.instance_from_str(words)
+        raise ValueError(f"give {metavar}, not '{' '.join(words)}'")
+
+    def spec_of(value: Any) -> PrimitiveConstructorSpec[Any]:
+        return next(spec for spec in specs if spec.is_instance(value))
+
+    counts = {count for spec in specs for count in (spec.nargs if isinstance(spec.nargs, tuple) else [spec.nargs])}
+    numbers = sorted(count for count in counts if count != "*")
+    return PrimitiveConstructorSpec(
+        nargs="*" if "*" in counts else numbers[0] if len(numbers) == 1 else tuple(numbers),
+        metavar=metavar,
+        instance_from_str=value_of,
+        is_instance=lambda value: any(spec.is_instance(value) for spec in specs),
+        str_from_instance=lambda value: spec_of(value).str_from_instance(value),
+        choices=sum((spec.choices or () for spec in specs), ()) if all(spec.choices for spec in specs) else None,
+    )
+
+
+def _fits(words: list[str], spec: PrimitiveConstructorSpec[Any]) -> bool:
+    """Whether words can be a value, by their number and the choices there are."""
+    counts = spec.nargs if isinstance(spec.nargs, tuple) else (spec.nargs,)
+    return (len(words) in counts or "*" in counts) and (spec.choices is None or set(words) <= set(spec.choices))

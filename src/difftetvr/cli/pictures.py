@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from difftetvr.cli.options import CaptureOptions, Output, load_model
+from difftetvr.cli.help import Groups
+from difftetvr.cli.options import CAPTURE_GROUPS, CaptureOptions, Color, Output, color_of, load_model
 from difftetvr.errors import CaptureError, counted
 from difftetvr.files import require_writable
 
@@ -36,9 +37,13 @@ class Compare:
     """Direction in which the cut is looked at."""
     no_cut: bool = False
     """Leave the cuts out."""
+    background: Color | None = None
+    """Behind the volume and the cuts: black, white or R G B; default: black, but white behind the views where they are
+    photographs that alpha cuts out."""
     device: str | None = None
     """Where to render."""
     views_of: OmitArgPrefixes[CaptureOptions] = field(default_factory=CaptureOptions)
+    groups: ClassVar[Groups] = CAPTURE_GROUPS
 
     def run(self, console: Console) -> None:
         """Renders and writes the picture."""
@@ -48,6 +53,7 @@ class Compare:
 
         require_png(self.output)
         require_writable(self.output, CaptureError)
+        background = None if self.background is None else color_of(self.background)
         if not self.models:
             raise CaptureError("There is no model to compare with; name one or more after the capture.")
         if self.names and len(self.names) != len(self.models):
@@ -57,7 +63,7 @@ class Compare:
         models = [Model(name, *load_model(path, self.device)) for name, path in zip(names, self.models, strict=True)]
         capture = self.views_of.sized_for(self.capture, self.device, console).load(self.capture, console)
         plane = None if self.no_cut else Plane(self.normal)
-        save_picture(self.output, compare_models(capture, models, self.rows, plane))
+        save_picture(self.output, compare_models(capture, models, self.rows, plane, background))
         console.print(f"Wrote {self.output}")
 
 
@@ -77,6 +83,8 @@ class Cut:
     """Pixels of the longer side."""
     no_cells: bool = False
     """Leave the outlines of the cells out."""
+    background: Color = "black"
+    """Behind what is cut: black, white or R G B."""
 
     def run(self, console: Console) -> None:
         """Draws and writes the picture."""
@@ -89,6 +97,7 @@ class Cut:
         if not 2 <= self.size <= _MOST_PIXELS:
             raise CaptureError(f"--size is {self.size}; it must lie between 2 and {_MOST_PIXELS}.")
         mesh, field_on_mesh = load(self.model)
-        picture = cut_picture(mesh, field_on_mesh, Plane(self.normal, self.origin), self.size, not self.no_cells)
+        plane, background = Plane(self.normal, self.origin), color_of(self.background)
+        picture = cut_picture(mesh, field_on_mesh, plane, self.size, not self.no_cells, background)
         save_picture(self.output, picture)
         console.print(f"Wrote {self.output} ({picture.width} x {picture.height})")

@@ -6,11 +6,12 @@ import math
 import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from difftetvr.cli.options import MeshOptions, Output
+from difftetvr.cli.help import Groups
+from difftetvr.cli.options import Color, MeshOptions, Output, color_of
 from difftetvr.errors import CameraError, CaptureError, MeshError, counted
 from difftetvr.files import require_writable
 
@@ -104,8 +105,8 @@ class Render:
     """Pixels."""
     height: int = 512
     """Pixels."""
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Linear R G B behind the volume."""
+    background: Color = "black"
+    """Behind the volume: black, white or linear R G B."""
     clip: tuple[float, float, float, float] | None = None
     """A B C D: show only what lies in the half-space A x + B y + C z + D >= 0."""
     show: Literal["image", "depth-complexity", "cell-quality"] = "image"
@@ -116,6 +117,11 @@ class Render:
     """Where to render, such as cpu or cuda; default: the best that works."""
     scalars: OmitArgPrefixes[ScalarOptions] = field(default_factory=ScalarOptions)
     mesh: OmitArgPrefixes[MeshOptions] = field(default_factory=MeshOptions)
+    groups: ClassVar[Groups] = {
+        "Camera": ("eye", "target", "up", "fov", "width", "height"),
+        "Scalars of a simulation": ("scalar", "transfer-function", "value-range", "attenuation"),
+        "How it is drawn": ("background", "clip", "show", "renderer", "split", "device"),
+    }
 
     def run(self, console: Console) -> None:
         """Renders and writes the picture."""
@@ -126,6 +132,7 @@ class Render:
         require_png(self.output)
         require_writable(self.output, CaptureError)
         self._require_valid_camera()
+        color_of(self.background)
         data = self.mesh.load(self.model, console)
         device = resolve_device(self.device)
         mesh = data.mesh.to(device=device)
@@ -150,7 +157,7 @@ class Render:
                 mesh,
                 content.to(device=mesh.vertices.device),
                 self._camera(mesh),
-                background=torch.tensor(self.background),
+                background=torch.tensor(color_of(self.background)),
                 renderer=self.renderer,
                 clip_plane=self.clip,
             )
@@ -178,7 +185,7 @@ class Render:
     def _require_valid_camera(self) -> None:
         if not 0.0 < self.fov < 180.0:
             raise CameraError(f"--fov is {self.fov:g} degrees; it must lie between 0 and 180.")
-        for name in ("eye", "target", "up", "background"):
+        for name in ("eye", "target", "up"):
             values = getattr(self, name)
             if values is not None and not all(math.isfinite(v) for v in values):
                 given = " ".join(f"{v:g}" for v in values)

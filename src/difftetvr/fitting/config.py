@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
@@ -17,6 +17,12 @@ from difftetvr.mesh.limits import CELLS_PER_CUBE, MAX_CELLS, MAX_DEGREE
 
 if TYPE_CHECKING:
     from difftetvr.capture.capture import Capture
+
+LossName = Literal["l2", "l1", "l1-ssim"]
+"""Names of `difftetvr.fitting.losses`."""
+
+Refine = Literal["exchange", "grow", "star", "none"]
+"""Names of refinement strategies: each but the last is also that of the field of `FitConfig` with its options."""
 
 Background = Literal["black", "white", "random"] | tuple[float, float, float]
 
@@ -31,7 +37,6 @@ _RANGES = {
     "evaluate_every": (0, LARGEST_COUNT),
     "seed": (0, LARGEST_COUNT),
 }
-_LOSSES = ("l2", "l1", "l1-ssim")
 _BACKGROUNDS = ("black", "white", "random")
 _STARTS = ("grid", "hull", "points")
 _DEFAULT_CELLS, _DEFAULT_ITERATIONS = 20_000, 2400
@@ -40,7 +45,6 @@ _PHOTO_PIXELS_PER_CELL = 12
 _FREE_BEFORE_POINTS, _FREE_BEFORE_BOUNDS = 0.8, 0.5
 _MOST_PHOTO_CELLS = 1_000_000
 _BAND_SHARE = 0.05  # of the run, from one band of harmonics to the next
-_STRATEGIES = ("exchange", "grow", "star", "none")
 _CHOICES_FOR_VOLUMES: dict[str, Any] = {
     "cells": _DEFAULT_CELLS,
     "start": "grid",
@@ -84,7 +88,7 @@ class FitConfig:
     """Mend an initial mesh that has flat cells or repeated vertices or cells; without it such a mesh is refused."""
     move: bool = True
     """Whether vertices move."""
-    refine: Literal["exchange", "grow", "star", "none"] = "exchange"
+    refine: Refine = "exchange"
     """How the mesh refines itself: exchange cells at their full number, grow from a coarse mesh, subdivide stars as in
     the article, or not at all."""
     location: Literal["vertex", "cell"] = "vertex"
@@ -93,7 +97,7 @@ class FitConfig:
     """Number of optimisation steps; default: 4800 for photographs, else 2400."""
     batch_views: int = 1
     """Training views per step; their gradients are averaged."""
-    loss: Literal["l2", "l1", "l1-ssim"] = "l2"
+    loss: LossName = "l2"
     """Mean squared (l2) or mean absolute (l1) difference of the images; l1-ssim has a fifth of 1 - SSIM in it."""
     harmonics: int | None = None
     """Bands of spherical harmonics, from 0 to 3, by which colours depend on the direction; default: 2 for photographs,
@@ -155,10 +159,10 @@ class FitConfig:
         share = self.free_space
         require(share is None or 0 <= share < 1, "free_space", share, "at least 0 and below 1")
         require(self.location in ("vertex", "cell"), "location", self.location, "vertex or cell")
-        require(self.loss in _LOSSES, "loss", self.loss, f"one of {', '.join(_LOSSES)}")
+        require(self.loss in get_args(LossName), "loss", self.loss, f"one of {', '.join(get_args(LossName))}")
         bands = self.harmonics
         require(bands is None or 0 <= bands <= MAX_DEGREE, "harmonics", bands, f"between 0 and {MAX_DEGREE}")
-        require(self.refine in _STRATEGIES, "refine", self.refine, f"one of {', '.join(_STRATEGIES)}")
+        require(self.refine in get_args(Refine), "refine", self.refine, f"one of {', '.join(get_args(Refine))}")
         on_cells = self.location == "cell" and self.refine != "none"
         require(not on_cells, "refine", self.refine, "none where colours belong to cells (location cell)")
         require(self.start in (None, *_STARTS), "start", self.start, f"one of {', '.join(_STARTS)}")

@@ -10,8 +10,6 @@ import torch
 from difftetvr.errors import MeshError
 from difftetvr.mesh import quality, validation
 from difftetvr.mesh.arrays import true_indices
-from difftetvr.mesh.making import generators
-from difftetvr.mesh.making.delaunay import delaunay as triangulate
 from difftetvr.mesh.topology.topology import Topology
 
 
@@ -102,6 +100,8 @@ class TetMesh:
         Raises:
             MeshError: A size is no positive integer, the box is empty or not finite, or the grid too large or too fine.
         """
+        from difftetvr.mesh.making import generators  # late: that room is built on this class
+
         vertices, tets = generators.grid(shape, lower, upper, dtype, device)
         return cls.from_valid(vertices, Topology(tets, vertices.shape[0]))
 
@@ -121,7 +121,9 @@ class TetMesh:
         Raises:
             MeshError: Fewer than four points, points not finite or in one plane, or no valid mesh was found.
         """
-        vertices, tets = triangulate(points)
+        from difftetvr.mesh.making.delaunay import delaunay
+
+        vertices, tets = delaunay(points)
         return cls.from_valid(vertices, Topology(tets, vertices.shape[0]))
 
     @property

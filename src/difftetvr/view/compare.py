@@ -9,6 +9,8 @@ from PIL import Image, ImageOps
 from difftetvr.capture.capture import Capture
 from difftetvr.errors import CaptureError, counted
 from difftetvr.fitting.records.evaluation import (
+    BLACK,
+    Color,
     Evaluation,
     evaluate,
     rendered_image,
@@ -33,7 +35,9 @@ class Model:
     field: Field
 
 
-def compare_models(capture: Capture, models: list[Model], rows: int = 1, plane: Plane | None = None) -> Image.Image:
+def compare_models(
+    capture: Capture, models: list[Model], rows: int = 1, plane: Plane | None = None, background: Color | None = None
+) -> Image.Image:
     """Draws truth | model | model ... for held-out views, labelled with the PSNR of this and of all views.
 
     Args:
@@ -41,6 +45,8 @@ def compare_models(capture: Capture, models: list[Model], rows: int = 1, plane: 
         models: What to show; at least one.
         rows: Views, evenly spread over those held out.
         plane: Adds a row of cuts along it through every model; the last one's is shown without cells, too. None: none.
+        background: Behind the volume and beside the cuts; default: black, but white behind the views where they are
+            photographs that alpha cuts out.
 
     Raises:
         CaptureError: The capture holds out no views with valid pixels, or rows is less than 1.
@@ -51,17 +57,20 @@ def compare_models(capture: Capture, models: list[Model], rows: int = 1, plane: 
         held_out = counted(len(tested), "view")
         raise CaptureError(f"'{capture.name}' holds out {held_out}, of which to show {rows}; show at least 1.")
     count = min(rows, len(tested))
-    background = usual_background(capture)
-    found = [evaluate(model.mesh, model.field, capture, tested, background) for model in models]
-    sheet = [_view_row(capture, models, found, (2 * i + 1) * len(tested) // (2 * count)) for i in range(count)]
+    behind_views = usual_background(capture) if background is None else background
+    found = [evaluate(model.mesh, model.field, capture, tested, behind_views) for model in models]
+    shown = [(2 * i + 1) * len(tested) // (2 * count) for i in range(count)]
+    sheet = [_view_row(capture, models, found, row, behind_views) for row in shown]
     if plane is not None:
-        sheet.append(_cut_row(models, plane))
+        sheet.append(_cut_row(models, plane, background or BLACK))
     return below(sheet)
 
 
-def _view_row(capture: Capture, models: list[Model], found: list[Evaluation], row: int) -> Image.Image:
+def _view_row(
+    capture: Capture, models: list[Model], found: list[Evaluation], row: int, background: Color
+) -> Image.Image:
     """Truth and all models, for one of the views that were evaluated."""
-    view, background = found[0].views[row], usual_background(capture)
+    view = found[0].views[row]
     panels = [_panel(to_picture(true_image(capture, view, background)), f"truth, held-out view {view}")]
     for model, evaluation in zip(models, found, strict=True):
         image = rendered_image(model.mesh, model.field, capture, view, background)
@@ -70,15 +79,16 @@ def _view_row(capture: Capture, models: list[Model], found: list[Evaluation], ro
     return beside(panels)
 
 
-def _cut_row(models: list[Model], plane: Plane) -> Image.Image:
+def _cut_row(models: list[Model], plane: Plane, background: Color) -> Image.Image:
     last = models[-1]
-    panels = [_cut(last, plane, f"cut, {last.name}", outlines=False)]
-    return beside(panels + [_cut(m, plane, f"cut, {m.name}, {counted(m.mesh.num_cells, 'cell')}") for m in models])
+    behind = tuple(round(255 * min(max(value, 0.0), 1.0)) for value in background)
 
+    def panel(model: Model, label: str, outlines: bool) -> Image.Image:
+        picture = cut_picture(model.mesh, model.field, plane, _PANEL, outlines, background)
+        return _panel(ImageOps.pad(picture, (_PANEL, _PANEL), color=behind), label)
 
-def _cut(model: Model, plane: Plane, label: str, outlines: bool = True) -> Image.Image:
-    picture = cut_picture(model.mesh, model.field, plane, _PANEL, outlines)
-    return _panel(ImageOps.pad(picture, (_PANEL, _PANEL), color="black"), label)
+    cells = [panel(m, f"cut, {m.name}, {counted(m.mesh.num_cells, 'cell')}", True) for m in models]
+    return beside([panel(last, f"cut, {last.name}", False), *cells])
 
 
 def _panel(picture: Image.Image, label: str) -> Image.Image:

@@ -59,7 +59,12 @@ class _Section:
 
 
 def cut_picture(
-    mesh: TetMesh, field: Field, plane: Plane | None = None, size: int = 512, outlines: bool = True
+    mesh: TetMesh,
+    field: Field,
+    plane: Plane | None = None,
+    size: int = 512,
+    outlines: bool = True,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Image.Image:
     """Draws a cut through a mesh: its colours as a slab looks that is a twentieth of the mesh thick, and its cells.
 
@@ -69,11 +74,12 @@ def cut_picture(
         plane: Where to cut; default: through the centre, seen along x.
         size: Pixels of the picture's longer side.
         outlines: Whether to draw the cells.
+        background: R G B behind the slab and beside the mesh.
 
     Raises:
         MeshError: The plane misses the mesh, or its normal is no direction.
     """
-    section = _section(mesh, field, plane or Plane())
+    section = _section(mesh, plane or Plane(), _slab_colors(mesh, field, np.array(background)))
     points = section.outlines.reshape(-1, 2)
     lower, extent = points.min(0), np.ptp(points, axis=0)
     scale = (size - 1) / extent.max()
@@ -83,12 +89,13 @@ def cut_picture(
         place = (place - lower) * scale
         return np.stack((place[..., 0], height - 1 - place[..., 1]), -1)
 
-    pixels = _fill(to_pixels(section.triangles), section.colors, width, height)
+    pixels = _fill(np.tile(np.array(background), (height, width, 1)), to_pixels(section.triangles), section.colors)
     picture = Image.fromarray((255.0 * pixels.clip(0, 1)).round().astype(np.uint8))
     return _with_outlines(picture, to_pixels(section.outlines)) if outlines else picture
 
 
-def _section(mesh: TetMesh, field: Field, plane: Plane) -> _Section:
+def _section(mesh: TetMesh, plane: Plane, colors: np.ndarray) -> _Section:
+    """Where a plane cuts a mesh with one colour for each of its vertices, or of its cells."""
     positions = mesh.vertices.detach().double().cpu().numpy()
     center = 0.5 * (positions.min(0) + positions.max(0))
     size = float(np.linalg.norm(np.ptp(positions, axis=0)))
@@ -100,8 +107,7 @@ def _section(mesh: TetMesh, field: Field, plane: Plane) -> _Section:
     cut = np.flatnonzero(above.any(1) & ~above.all(1))
     if not len(cut):
         raise MeshError(f"The plane at {tuple(origin.tolist())} misses the mesh; move it into the mesh's bounds.")
-    colors = _slab_colors(mesh, field, size / 20.0)
-    per_cell = field.location_on(mesh) == "cell"
+    per_cell = len(colors) != len(positions)
 
     places, shades, owners = [], [], []
     for i, j in LOCAL_EDGES:
@@ -132,15 +138,16 @@ def _polygons(places: np.ndarray, shades: np.ndarray, owners: np.ndarray) -> _Se
     return _Section(places[corners], shades[corners], np.stack((places, places[following]), 1))
 
 
-def _slab_colors(mesh: TetMesh, field: Field, thickness: float) -> np.ndarray:
-    """Premultiplied colour of a slab of constant colour and density."""
-    opacity = -torch.expm1(-field.density.detach().double() * thickness)
-    return (field.color.detach().double() * opacity[:, None]).cpu().numpy()
+def _slab_colors(mesh: TetMesh, field: Field, background: np.ndarray) -> np.ndarray:
+    """What a slab of constant colour and density looks like that is a twentieth of the mesh thick."""
+    lower, upper = mesh.bounds().detach().double().cpu()
+    density, color = field.density.detach().double().cpu(), field.color.detach().double().cpu()
+    opacity = -torch.expm1(-density * (upper - lower).norm() / 20.0)[:, None]
+    return (color * opacity).numpy() + background * (1.0 - opacity.numpy())
 
 
-def _fill(triangles: np.ndarray, colors: np.ndarray, width: int, height: int) -> np.ndarray:
-    """(H, W, 3) image of triangles with linear colours; black where there are none."""
-    image = np.zeros((height, width, 3))
+def _fill(image: np.ndarray, triangles: np.ndarray, colors: np.ndarray) -> np.ndarray:
+    """Draws triangles with linear colours into an (H, W, 3) image, and returns it."""
     extents = np.ptp(triangles, axis=1).prod(1) + 1.0
     # As many at a time as have some million pixels in their boxes.
     parts = np.flatnonzero(np.diff(np.cumsum(extents) // _PIXELS_AT_ONCE)) + 1

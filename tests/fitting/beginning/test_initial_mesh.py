@@ -8,8 +8,8 @@ import pytest
 import torch
 
 import difftetvr.cli as cli
-from difftetvr.errors import MeshError
-from difftetvr.fitting import FitConfig, FitError, fit
+from difftetvr.errors import FitError, MeshError
+from difftetvr.fitting import FitConfig, fit
 from difftetvr.fitting.trainer import Trainer
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.mesh.io import save

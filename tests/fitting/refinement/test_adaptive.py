@@ -6,7 +6,8 @@ import importlib
 import pytest
 import torch
 
-from difftetvr.fitting import FitConfig, FitError, fit
+from difftetvr.errors import FitError
+from difftetvr.fitting import FitConfig, fit
 from difftetvr.fitting.motion import Motion
 from difftetvr.fitting.records.checkpoint import Checkpoint
 from difftetvr.fitting.refinement import Exchange, Grow, Refinement, Star

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from difftetvr.capture.free_space import FreeSpace
-from difftetvr.fitting import FitError
+from difftetvr.errors import FitError
 from difftetvr.fitting.refinement import Exchange, Grow, Moment, Situation, Star
 from difftetvr.fitting.refinement.gains import bisection_gains, collapse_costs, edges_before, flip_gains
 from difftetvr.mesh import Field, TetMesh, bisect_edges, collapse_edges

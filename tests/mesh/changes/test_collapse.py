@@ -11,7 +11,8 @@ from mesh.changes.checks import SEEDS, check_change, random_mesh
 from scipy.spatial import ConvexHull
 
 from difftetvr.errors import MeshError
-from difftetvr.mesh import TetMesh, Topology, collapse
+from difftetvr.mesh import TetMesh, Topology
+from difftetvr.mesh.changes import collapse
 from difftetvr.mesh.changes.bisection import bisect_edges, independent_edges
 from difftetvr.mesh.changes.collapse import collapse_edges
 from difftetvr.mesh.changes.independent import BestFirst, best_first

@@ -9,7 +9,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from difftetvr.mesh import TetMesh, Topology, faces
+from difftetvr.mesh import TetMesh, Topology
+from difftetvr.mesh.topology import faces
 from difftetvr.mesh.topology.topology import LOCAL_FACES
 
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from difftetvr.mesh import TetMesh
 from difftetvr.mesh.topology.topology import LOCAL_FACES
-from difftetvr.rendering import cell_order
+from difftetvr.rendering.tracers import cell_order
 from difftetvr.rendering.tracers.cell_order import visibility_order
 
 seeds = st.integers(0, 2**32 - 1)

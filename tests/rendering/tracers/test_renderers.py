@@ -15,8 +15,9 @@ from rendering.helpers import LEAVES, leaves_of, oracle_gradients, render_leaves
 from difftetvr.backend import backend_for
 from difftetvr.errors import DiffTetError, MeshError
 from difftetvr.mesh import Field, TetMesh
-from difftetvr.rendering import Camera, OrderWarning, linked_list, projected, render
+from difftetvr.rendering import Camera, OrderWarning, render
 from difftetvr.rendering.inspection import inspect_rays
+from difftetvr.rendering.tracers import linked_list, projected
 from difftetvr.rendering.tracers.bands import bands_of
 from difftetvr.rendering.tracers.entry_table import HalfFaceScene
 from difftetvr.rendering.tracers.tiles import Tiler

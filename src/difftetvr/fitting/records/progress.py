@@ -7,12 +7,14 @@ from types import TracebackType
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
+from rich.table import Column
 
 from difftetvr.errors import counted
 from difftetvr.fitting.records.history import RefinementRecord
 from difftetvr.fitting.records.result import Progress as Status
 
 _LINE_SECONDS = 5.0
+_BAR_WIDTH = 12
 
 
 class ProgressDisplay:
@@ -26,8 +28,10 @@ class ProgressDisplay:
 
     def __init__(self, console: Console | None = None) -> None:
         self._console = console or Console()
-        columns = (BarColumn(bar_width=12), TextColumn("{task.fields[status]}", markup=False))
-        self._bar = Progress(*columns, console=self._console) if self._console.is_terminal else None
+        # Where both do not fit, the text is cut off, not the bar.
+        bar = BarColumn(bar_width=_BAR_WIDTH, table_column=Column(min_width=_BAR_WIDTH, no_wrap=True))
+        text = TextColumn("{task.fields[status]}", markup=False, table_column=Column(ratio=1, no_wrap=True))
+        self._bar = Progress(bar, text, console=self._console) if self._console.is_terminal else None
         self._task = self._bar.add_task("", total=None, status="starting") if self._bar else None
         self._begin: tuple[float, int] | None = None
         self._line_due = 0.0

@@ -46,6 +46,40 @@ class Content:
     cell_data: dict[str, np.ndarray]
 
 
+@dataclass(frozen=True)
+class Output:
+    """A mesh to be written.
+
+    Attributes:
+        vertices: (V, 3) positions.
+        tets: (T, 4) vertex indices of cells with positive volume.
+        arrays: The field's arrays by name, of V or T rows; none where the geometry alone is written.
+        is_per_cell: Whether they belong to the cells.
+        path: Where the file will be in the end; a temporary one is written first.
+    """
+
+    vertices: np.ndarray
+    tets: np.ndarray
+    arrays: dict[str, np.ndarray]
+    is_per_cell: bool
+    path: Path
+
+    @property
+    def rgba(self) -> np.ndarray | None:
+        """(V, 4) or (T, 4) red, green, blue, density; None where there are none."""
+        return np.column_stack((self.arrays["color"], self.arrays["density"])) if self.arrays else None
+
+    @property
+    def point_data(self) -> dict[str, np.ndarray]:
+        """Arrays of the vertices."""
+        return {} if self.is_per_cell else self.arrays
+
+    @property
+    def cell_data(self) -> dict[str, np.ndarray]:
+        """Arrays of the cells."""
+        return self.arrays if self.is_per_cell else {}
+
+
 def damaged(path: Path, problem: str) -> MeshError:
     """The error for a file that breaks the rules of its format.
 

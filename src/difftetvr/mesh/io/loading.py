@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -14,7 +13,7 @@ from difftetvr.errors import MeshError, counted
 from difftetvr.mesh import validation
 from difftetvr.mesh.field import Field, Location
 from difftetvr.mesh.io.content import CellBlock, Content, require_array
-from difftetvr.mesh.io.formats import bintet, gmsh, medit, npz, ovm, tetgen, through_meshio, vtk
+from difftetvr.mesh.io.formats.table import format_of
 from difftetvr.mesh.making.conversion import CONVERTIBLE, is_quadratic, num_nodes, to_tetrahedra
 from difftetvr.mesh.making.repair import repair
 from difftetvr.mesh.tetmesh import TetMesh
@@ -26,19 +25,6 @@ HARMONICS = "harmonics"
 Flat = Literal["refuse", "drop", "repair"]
 """What becomes of cells of exactly zero volume."""
 
-_READERS: dict[str, Callable[[Path], Content]] = {
-    ".bintet": bintet.read,
-    ".ele": tetgen.read,
-    ".mesh": medit.read,
-    ".msh": gmsh.read,
-    ".node": tetgen.read,
-    ".npz": npz.read,
-    ".ovm": ovm.read,
-    ".vtk": vtk.read,
-    ".vtu": through_meshio.read_vtu,
-    ".xdmf": through_meshio.read_xdmf,
-    ".xmf": through_meshio.read_xdmf,
-}
 # What commonly lies beside the volume cells in a file and bounds them; it carries no volume.
 _LOWER_DIMENSIONAL = ("vertex", "line", "triangle", "quad", "polygon", "pixel", "empty", "poly_")
 _LARGEST_INTEGER = 2**63 - 1
@@ -233,7 +219,7 @@ def _read(path: Path) -> Content:
     if not path.is_file():
         raise MeshError(f"There is no mesh file {path}; check the path.")
     try:
-        content = _READERS.get(path.suffix.lower(), through_meshio.read)(path)
+        content = format_of(path).read(path)
     except OSError as error:
         reason = error.strerror or type(error).__name__
         raise MeshError(f"{path} cannot be read ({reason}); check the disk and the file's permissions.") from error

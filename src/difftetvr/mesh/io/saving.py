@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -11,17 +10,18 @@ import torch
 from difftetvr.errors import MeshError
 from difftetvr.files import atomic_write
 from difftetvr.mesh.field import Field
-from difftetvr.mesh.io.formats import bintet, npz, ovm, tetgen, through_meshio
+from difftetvr.mesh.io.content import Output
+from difftetvr.mesh.io.formats.table import FORMATS, format_of
 from difftetvr.mesh.io.loading import HARMONICS
 from difftetvr.mesh.tetmesh import TetMesh
 
-GEOMETRY_SUFFIXES = (".mesh",)
+GEOMETRY_SUFFIXES = tuple(suffix for suffix, kind in FORMATS.items() if kind.write and not kind.holds_field)
 """Suffixes of formats that hold a mesh but no field."""
 
-WRITABLE_SUFFIXES = (".vtu", ".vtk", ".msh", ".xdmf", ".npz", ".bintet", ".ovm", ".node", ".ele")
+WRITABLE_SUFFIXES = tuple(suffix for suffix, kind in FORMATS.items() if kind.write and kind.holds_field)
 """Suffixes of formats that hold a mesh with its field."""
 
-DIRECTIONAL_SUFFIXES = (".vtu", ".npz")
+DIRECTIONAL_SUFFIXES = tuple(suffix for suffix, kind in FORMATS.items() if kind.holds_harmonics)
 """Suffixes of formats that hold spherical harmonics, too: ``harmonics``, 3 components for each function."""
 
 
@@ -44,26 +44,14 @@ def save(path: str | Path, mesh: TetMesh, field: Field | None = None) -> None:
     """
     path = Path(path)
     require_writable_format(path, with_field=field is not None)
-    suffix = path.suffix.lower()
-    if suffix == ".bintet":
+    kind = format_of(path)
+    assert kind.write is not None
+    if kind.is_single:
         mesh = mesh.to(dtype=torch.float32)
-    location = "vertex" if field is None else field.location_on(mesh)
-    arrays = _arrays(path, field)
-    vertices, tets = _array(mesh.vertices), _array(mesh.tets)
+    is_per_cell = field is not None and field.location_on(mesh) == "cell"
+    output = Output(_array(mesh.vertices), _array(mesh.tets), _arrays(path, field), is_per_cell, path)
     with atomic_write(path, MeshError) as temporary:
-        if suffix == ".npz":
-            place = {} if field is None else {"location": np.array(location)}
-            npz.write(temporary, {"vertices": vertices, "tets": tets, **arrays, **place})
-        elif suffix in (".xdmf", *through_meshio.SUFFIXES):
-            here, there = ("point_data", "cell_data") if location == "vertex" else ("cell_data", "point_data")
-            data = {here: arrays, there: {}}
-            if suffix == ".xdmf":
-                _write_xdmf(temporary, vertices, tets, data)
-            else:
-                through_meshio.write(temporary, suffix, vertices, tets, data)
-        else:
-            rgba = None if field is None else np.column_stack((arrays["color"], arrays["density"]))
-            _write_rgba(path, temporary, (vertices, tets), rgba, location == "cell")
+        kind.write(temporary, output)
 
 
 def require_writable_format(path: Path, with_field: bool = True) -> None:
@@ -102,28 +90,6 @@ def _arrays(path: Path, field: Field | None) -> dict[str, np.ndarray]:
             )
         arrays[HARMONICS] = _array(field.harmonics.flatten(1))
     return arrays
-
-
-def _write_xdmf(path: Path, *content: Any) -> None:
-    from difftetvr.mesh.io.formats import xdmf  # late: it loads meshio and so every format that meshio knows
-
-    xdmf.write(path, *content)
-
-
-def _write_rgba(
-    path: Path, temporary: Path, mesh: tuple[np.ndarray, np.ndarray], rgba: np.ndarray | None, per_cell: bool
-) -> None:
-    """Write a format that keeps colour and density in one array."""
-    suffix = path.suffix.lower()
-    if suffix in (".node", ".ele"):
-        node, ele = tetgen.files(path)
-        other = ele if suffix == ".node" else node
-        with atomic_write(other, MeshError) as partner:
-            pair = (temporary, partner) if suffix == ".node" else (partner, temporary)
-            tetgen.write(*pair, mesh, rgba, per_cell)
-    else:
-        write = bintet.write if suffix == ".bintet" else ovm.write
-        write(temporary, *mesh, rgba, per_cell)
 
 
 def _array(tensor: torch.Tensor) -> np.ndarray:

@@ -1,4 +1,5 @@
 from . import pinhole as pinhole
+from . import pinhole_rays as pinhole_rays
 from .pinhole import Camera as Camera
 
-__all__ = ["Camera", "pinhole"]
+__all__ = ["Camera", "pinhole", "pinhole_rays"]

@@ -6,10 +6,15 @@ import math
 import operator
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import torch
 
 from difftetvr.errors import CameraError
+
+if TYPE_CHECKING:
+    from difftetvr.backend import Backend
+    from difftetvr.rendering.traversal.rays import CameraRays
 
 _ORTHONORMALITY_TOLERANCE = 1e-3
 _MOST_PIXELS = 1 << 28  # four floats a pixel stay within the kernels' 32-bit indices
@@ -142,6 +147,12 @@ class Camera:
         rows, columns = torch.meshgrid(y, x, indexing="ij")
         directions = torch.stack([columns, rows, torch.ones_like(rows)], dim=-1)
         return directions / directions.norm(dim=-1, keepdim=True)
+
+    def kernel_rays(self, backend: Backend) -> CameraRays:
+        """The camera's rays for kernels of a back end."""
+        from difftetvr.rendering.cameras.pinhole_rays import PinholeRays  # late: cameras are there without kernels
+
+        return PinholeRays.of(backend, self)
 
     def with_size(self, width: int, height: int) -> Camera:
         """The same view at another resolution."""

@@ -11,7 +11,6 @@ from difftetvr.backend import Backend
 from difftetvr.mesh import TetMesh
 from difftetvr.mesh.topology.topology import LOCAL_FACES
 from difftetvr.rendering.tracers.entry_table import EntryScene
-from difftetvr.rendering.traversal.rays import pixel_frame
 from difftetvr.rendering.traversal.walk import BOUNDARY, crossing_depth, find_exit, holds_ray
 
 # Cells this near to the camera, relative to their size, are tried as the cell that holds it; each ray then decides.
@@ -64,8 +63,8 @@ def start_rows(scene: EntryScene, mesh: TetMesh, around: torch.Tensor, begin: in
     """
     backend, uint, real = scene.backend, scene.backend.UInt, scene.backend.Float
     pixel = dr.arange(uint, scene.pixel_count)
-    row_index = pixel // scene.pinhole.width
-    frame = pixel_frame(scene.pinhole, pixel - row_index * scene.pinhole.width, row_index)
+    row_index = pixel // scene.rays.width
+    frame = scene.rays.frame(pixel - row_index * scene.rays.width, row_index)
     none = scene.no_row
     neighbors = backend.uints(mesh.topology.cell_adjacency[around.long()].T)
 

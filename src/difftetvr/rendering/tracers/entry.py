@@ -18,7 +18,6 @@ from difftetvr.rendering.cameras.pinhole import Camera
 from difftetvr.rendering.tracers.camera_inside import cells_around_camera, start_rows
 from difftetvr.rendering.tracers.entry_table import EntryScene, EntryTable
 from difftetvr.rendering.tracers.rasterise import Hit, WorkItems, for_each_hit, work_items
-from difftetvr.rendering.traversal.rays import Pinhole
 
 
 @dataclass(frozen=True)
@@ -61,7 +60,7 @@ def find_entries(backend: Backend, mesh: TetMesh, camera_vertices: torch.Tensor,
     scene = EntryScene(
         backend,
         camera,
-        Pinhole.of(backend, camera),
+        camera.kernel_rays(backend),
         backend.floats(camera_vertices),
         *(backend.uints(part) for part in (table.corners, table.cells, table.apices)),
     )
@@ -87,7 +86,7 @@ def _count(scene: EntryScene, items: WorkItems | None, start: Any | None) -> tup
         scene.backend.run(count, row_of_pixel)
 
     def visit(hit: Hit) -> None:
-        pixel = hit.row * scene.pinhole.width + hit.column
+        pixel = hit.row * scene.rays.width + hit.column
         dr.scatter_add(count, uint(1), pixel, hit.is_hit)
         dr.scatter(row_of_pixel, hit.face, pixel, hit.is_hit)
 
@@ -115,7 +114,7 @@ def _fill(scene: EntryScene, items: WorkItems | None, start: Any | None, offset:
     scene.backend.run(rows, depths, used)
 
     def visit(hit: Hit) -> None:
-        pixel = hit.row * scene.pinhole.width + hit.column
+        pixel = hit.row * scene.rays.width + hit.column
         slot = dr.gather(uint, offset, pixel, hit.is_hit) + dr.scatter_inc(used, pixel, hit.is_hit)
         dr.scatter(rows, hit.face, slot, hit.is_hit)
         dr.scatter(depths, hit.depth, slot, hit.is_hit)

@@ -12,7 +12,7 @@ from difftetvr.backend import Backend
 from difftetvr.mesh import TetMesh
 from difftetvr.mesh.topology.topology import LOCAL_FACES
 from difftetvr.rendering.cameras.pinhole import Camera
-from difftetvr.rendering.traversal.rays import Pinhole
+from difftetvr.rendering.traversal.rays import CameraRays
 from difftetvr.rendering.traversal.walk import Corner, Face, make_face
 
 
@@ -57,7 +57,7 @@ class FaceScene:
 
     backend: Backend
     camera: Camera
-    pinhole: Pinhole
+    rays: CameraRays
     vertices: Any
 
     def indices(self, row: Any, mask: Any = True) -> list[Any]:
@@ -111,7 +111,7 @@ class HalfFaceScene(FaceScene):
     def of(backend: Backend, camera: Camera, mesh: TetMesh, vertices: torch.Tensor) -> HalfFaceScene:
         """Upload a mesh with (V, 3) vertices in camera space."""
         points, tets = backend.floats(vertices), backend.uints(mesh.tets)
-        return HalfFaceScene(backend, camera, Pinhole.of(backend, camera), points, tets)
+        return HalfFaceScene(backend, camera, camera.kernel_rays(backend), points, tets)
 
     def indices(self, row: Any, mask: Any = True) -> list[Any]:
         """See :meth:`FaceScene.indices`."""

@@ -18,7 +18,7 @@ from difftetvr.rendering.tracers.bands import Band
 from difftetvr.rendering.tracers.camera_inside import cells_around_camera
 from difftetvr.rendering.tracers.entry_table import HalfFaceScene
 from difftetvr.rendering.tracers.rasterise import Hit, for_each_hit, work_items
-from difftetvr.rendering.traversal.rays import lane_count, lane_pixel, pixel_frame, pixel_lane
+from difftetvr.rendering.traversal.rays import lane_count, lane_pixel, pixel_lane
 from difftetvr.rendering.traversal.walk import crossing_depth, find_exit, holds_ray
 
 NONE = 0xFFFFFFFF
@@ -56,10 +56,10 @@ class FragmentRaster:
     def count(self) -> torch.Tensor:
         """(lanes,) int64 number of fragments of each lane: its depth complexity."""
         uint = self.scene.backend.UInt
-        counts = dr.zeros(uint, lane_count(self.scene.camera))
+        counts = dr.zeros(uint, lane_count(self.scene.camera.width, self.scene.camera.height))
 
         def add(hit: Hit) -> None:
-            dr.scatter_add(counts, uint(1), pixel_lane(self.scene.pinhole, hit.column, hit.row), hit.is_hit)
+            dr.scatter_add(counts, uint(1), pixel_lane(self.scene.rays, hit.column, hit.row), hit.is_hit)
 
         self._for_each(add, counts)
         return self.scene.backend.tensor(self.scene.backend.Int(counts)).long()
@@ -78,7 +78,7 @@ class FragmentRaster:
         first, last = backend.opaque_uint(band.first), backend.opaque_uint(band.last)
 
         def push(hit: Hit) -> None:
-            lane = pixel_lane(self.scene.pinhole, hit.column, hit.row)
+            lane = pixel_lane(self.scene.rays, hit.column, hit.row)
             is_hit = hit.is_hit & (lane >= first) & (lane < last)
             node = dr.scatter_inc(used, uint(0), is_hit)
             before = dr.scatter_exch(lists.heads, node, lane - first, is_hit)
@@ -102,8 +102,9 @@ class FragmentRaster:
     def _for_each_around(self, visit: Any) -> None:
         """Crossings of cells that hold the camera: they begin behind it, where no face is rasterised."""
         scene, uint = self.scene, self.scene.backend.UInt
-        column, row, valid = lane_pixel(scene.pinhole, dr.arange(uint, lane_count(scene.camera)))
-        frame = pixel_frame(scene.pinhole, column, row)
+        lanes = lane_count(scene.camera.width, scene.camera.height)
+        column, row, valid = lane_pixel(scene.rays, dr.arange(uint, lanes))
+        frame = scene.rays.frame(column, row)
         count = scene.backend.opaque_uint(4 * dr.width(self.around))
 
         def body(index: Any) -> tuple[Any]:

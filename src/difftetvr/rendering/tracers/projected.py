@@ -75,7 +75,7 @@ class Projected:
 
     def _composite(self, kernel: Kernel, rays: Rays, lists: TileLists, ray: Any) -> Any:
         view, uint = self.view, self.view.backend.UInt
-        width = self.scene.pinhole.width
+        width = self.scene.rays.width
         row = rays.pixel // width
         tile = (row >> TILE_BITS) * self.tiler.columns + ((rays.pixel - row * width) >> TILE_BITS)
         end = dr.gather(uint, lists.end, tile, rays.valid)

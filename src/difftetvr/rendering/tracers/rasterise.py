@@ -10,14 +10,11 @@ import drjit as dr
 import torch
 
 from difftetvr.rendering.tracers.entry_table import FaceScene
-from difftetvr.rendering.traversal.rays import pixel_frame
+from difftetvr.rendering.traversal.rays import largest_coordinate, rounding_of
 from difftetvr.rendering.traversal.walk import Corner, crossing_depth, holds_ray, interpolate, make_face
 
 _ITEM_PIXELS = 64  # a work item has about so many pixels, at most _ITEM_ROWS rows, and at least one
 _ITEM_ROWS = 8
-# Beyond what rounding moves a projection by, for images of up to 64 k pixels; the exact rule decides.
-_MARGIN = 0.0625
-_NEAR_PLANE = 2.0**-8  # points nearer to the camera's plane, in units of their distance, are not projected
 
 
 @dataclass
@@ -52,7 +49,7 @@ def work_items(scene: FaceScene, begin: int, end: int) -> WorkItems | None:
     backend, uint, integer = scene.backend, scene.backend.UInt, scene.backend.Int
     face = dr.arange(uint, end - begin) + backend.opaque_uint(begin)
     points = [scene.point(vertex) for vertex in scene.indices(face)]
-    (column0, column1), (row0, row1), visible = pixel_range(scene, points)
+    (column0, column1), (row0, row1), visible = scene.rays.pixel_range(backend, points)
     width = dr.fmax(scene.backend.Float(column1 - column0 + 1), 1.0)
     per_item = integer(dr.fmin(dr.fmax(_ITEM_PIXELS / width, 1.0), float(_ITEM_ROWS)))
     count = dr.select(visible & _may_face_camera(points), (row1 - row0 + per_item) // per_item, 0)
@@ -73,73 +70,6 @@ def work_items(scene: FaceScene, begin: int, end: int) -> WorkItems | None:
     items = WorkItems(owner + backend.opaque_uint(begin), uint(first), uint(integer(last)), *columns)
     backend.run(items)
     return items
-
-
-def pixel_range(scene: FaceScene, points: list[list[Any]]) -> tuple[tuple[Any, Any], tuple[Any, Any], Any]:
-    """Pixels that may see the convex hull of some points in camera space.
-
-    Returns:
-        First and last column, first and last row, and whether there are any.
-    """
-    real, pinhole = scene.backend.Float, scene.pinhole
-    size, farthest = _size(points), real(-dr.inf)
-    for point in points:
-        farthest = dr.fmax(farthest, point[2])
-    # Points behind the camera, or so near to its plane that rounding moves their projection, have no place in it.
-    ahead = [point[2] > size * _NEAR_PLANE for point in points]
-    box = []
-    for axis, scale, center, pixels in (
-        (0, pinhole.fx, pinhole.cx, pinhole.width),
-        (1, pinhole.fy, pinhole.cy, pinhole.height),
-    ):
-        low, high = _projection(points, axis, ahead, size)
-        last = real(pixels) - 1.0
-        # Pixel i's ray goes through i + 1/2: those from ceil(low - 1/2) to floor(high - 1/2) may see the face.
-        begin, end = dr.ceil(low * scale + center - (0.5 + _MARGIN)), dr.floor(high * scale + center - (0.5 - _MARGIN))
-        begin, end = dr.fmin(dr.fmax(begin, 0.0), last + 1.0), dr.fmin(dr.fmax(end, -1.0), last)
-        box.append((scene.backend.Int(begin), scene.backend.Int(end)))
-    columns, rows = box
-    visible = (farthest > -_rounding(size)) & (columns[1] >= columns[0]) & (rows[1] >= rows[0])
-    return columns, rows, visible
-
-
-def _projection(points: list[list[Any]], axis: int, ahead: list[Any], size: Any) -> tuple[Any, Any]:
-    """Range of x / z, or y / z, over the part of a convex hull in front of the camera; infinite where it has no end.
-
-    Seen from a point ahead, one that is not lies on the one side or on the other. On this side there is no end, on the
-    other one the points ahead are.
-    """
-    infinity = dr.inf + 0.0 * size
-    low, high, any_ahead = infinity, -infinity, dr.mask_t(size)(False)
-    for point, is_ahead in zip(points, ahead, strict=True):
-        value = point[axis] / point[2]
-        low = dr.fmin(low, dr.select(is_ahead, value, infinity))
-        high = dr.fmax(high, dr.select(is_ahead, value, -infinity))
-        any_ahead |= is_ahead
-    for one, is_ahead in zip(points, ahead, strict=True):
-        for other, other_is_ahead in zip(points, ahead, strict=True):
-            if one is other:
-                continue
-            crosses = is_ahead & ~other_is_ahead
-            side = other[axis] * one[2] - one[axis] * other[2]
-            sure = _rounding(size) * (dr.abs(one[axis]) + dr.abs(other[axis]) + dr.abs(one[2]) + dr.abs(other[2]))
-            low = dr.select(crosses & (side < sure), -infinity, low)
-            high = dr.select(crosses & (side > -sure), infinity, high)
-    return dr.select(any_ahead, low, -infinity), dr.select(any_ahead, high, infinity)
-
-
-def _size(points: list[list[Any]]) -> Any:
-    """Greatest coordinate of some points."""
-    size = type(points[0][0])(0)
-    for point in points:
-        for value in point:
-            size = dr.fmax(size, dr.abs(value))
-    return size
-
-
-def _rounding(size: Any) -> Any:
-    """By how much, at most, a ray's frame moves points of which ``size`` is the greatest coordinate."""
-    return 16.0 * dr.epsilon(size) * size
 
 
 def _may_face_camera(points: list[list[Any]]) -> Any:
@@ -163,10 +93,11 @@ def for_each_hit(scene: FaceScene, items: WorkItems | None, visit: Callable[[Hit
         return
     vertices = scene.indices(items.face)
     points = [scene.point(vertex) for vertex in vertices]
-    passes_camera = dr.fmin(points[0][2], dr.fmin(points[1][2], points[2][2])) <= _rounding(_size(points))
+    nearest = dr.fmin(points[0][2], dr.fmin(points[1][2], points[2][2]))
+    passes_camera = nearest <= rounding_of(largest_coordinate(points))
 
     def body(column: Any, row: Any) -> tuple[Any, Any]:
-        frame = pixel_frame(scene.pinhole, column, row)
+        frame = scene.rays.frame(column, row)
         corners = []
         for vertex, point in zip(vertices, points, strict=True):
             a, b, t = frame.project(*point)

@@ -10,7 +10,6 @@ import torch
 
 from difftetvr.rendering.tracers.bands import bands_of
 from difftetvr.rendering.tracers.entry_table import HalfFaceScene
-from difftetvr.rendering.tracers.rasterise import pixel_range
 
 TILE_BITS = 2
 """Tiles have 4 x 4 pixels: those of 16 lanes that lie side by side in Morton order, a vector of AVX-512."""
@@ -47,7 +46,7 @@ class Tiler:
         backend, uint = scene.backend, scene.backend.UInt
         cell = backend.uints(order.to(torch.int32))
         corners = dr.gather(backend.UInt4, scene.tets, cell)
-        columns, rows, visible = pixel_range(scene, [scene.point(corners[k]) for k in range(4)])
+        columns, rows, visible = scene.rays.pixel_range(scene.backend, [scene.point(corners[k]) for k in range(4)])
         shift = lambda value: uint(dr.select(visible, value, 0)) >> TILE_BITS  # noqa: E731
         column0, column1, row0, row1 = (shift(value) for value in (*columns, *rows))
         self.width = backend.Int(column1 - column0 + 1)

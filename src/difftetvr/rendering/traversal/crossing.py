@@ -16,7 +16,7 @@ import drjit as dr
 from difftetvr.backend import Backend
 from difftetvr.optics import OpticalModel
 from difftetvr.rendering.cameras.pinhole import Camera
-from difftetvr.rendering.traversal.rays import Frame, Pinhole, lane_count, lane_pixel, pixel_frame
+from difftetvr.rendering.traversal.rays import Frame, lane_count, lane_pixel
 from difftetvr.rendering.traversal.transfer import Transfer
 from difftetvr.rendering.traversal.walk import Corner, Exit, Face, find_exit, interpolate, make_face
 
@@ -72,12 +72,12 @@ class Rays:
 def make_rays(view: View, first: int = 0, last: int | None = None) -> Rays:
     """Rays of all pixels, one a lane, in Morton order; or those of the lanes from ``first`` to before ``last``."""
     uint = view.backend.UInt
-    pinhole = Pinhole.of(view.backend, view.camera)
-    lane = dr.arange(uint, (lane_count(view.camera) if last is None else last) - first)
+    camera = view.camera.kernel_rays(view.backend)
+    lane = dr.arange(uint, (lane_count(view.camera.width, view.camera.height) if last is None else last) - first)
     if first:
         lane += view.backend.opaque_uint(first)
-    column, row, valid = lane_pixel(pinhole, lane)
-    return Rays(row * pinhole.width + column, valid, pixel_frame(pinhole, column, row))
+    column, row, valid = lane_pixel(camera, lane)
+    return Rays(row * camera.width + column, valid, camera.frame(column, row))
 
 
 @dataclass

@@ -8,40 +8,13 @@ ray meets a face is decided by signs of 2-D edge functions of (a, b) alone, neve
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import drjit as dr
-import torch
 
 from difftetvr.backend import Backend
-from difftetvr.rendering.cameras.pinhole import Camera
 
 _BLOCK_BITS = 6  # pixels are visited in Morton order inside blocks of 64 x 64
-
-
-@dataclass
-class Pinhole:
-    """Intrinsics and image size of a camera as device values, so that a new view needs no recompilation."""
-
-    inverse_fx: Any
-    inverse_fy: Any
-    fx: Any
-    fy: Any
-    cx: Any
-    cy: Any
-    width: Any
-    height: Any
-
-    @staticmethod
-    def of(backend: Backend, camera: Camera) -> Pinhole:
-        """Upload a camera's intrinsics."""
-        values = [1.0 / camera.fx, 1.0 / camera.fy, camera.fx, camera.fy, camera.cx, camera.cy]
-        floats = backend.floats(torch.tensor(values, dtype=backend.dtype, device=backend.device))
-        sizes = backend.uints(torch.tensor([camera.width, camera.height], dtype=torch.int32, device=backend.device))
-        return Pinhole(
-            *(dr.gather(backend.Float, floats, backend.UInt(i)) for i in range(6)),
-            *(dr.gather(backend.UInt, sizes, backend.UInt(i)) for i in range(2)),
-        )
 
 
 @dataclass
@@ -61,42 +34,64 @@ class Frame:
         return tuple(dr.fma(self.a[k], a, dr.fma(self.b[k], b, self.direction[k] * t)) for k in range(3))
 
 
-def pixel_frame(pinhole: Pinhole, column: Any, row: Any) -> Frame:
-    """Frame of the ray through the centre of a pixel (Duff et al. 2017, branch-free because z > 0)."""
-    float_t = type(pinhole.fx)
-    x = ((float_t(column) + 0.5) - pinhole.cx) * pinhole.inverse_fx
-    y = ((float_t(row) + 0.5) - pinhole.cy) * pinhole.inverse_fy
-    z = 1.0 / dr.sqrt(dr.fma(x, x, dr.fma(y, y, float_t(1))))
-    x, y = x * z, y * z
-    inverse = -1.0 / (1.0 + z)
-    xy = x * y * inverse
-    a = (dr.fma(x * x, inverse, float_t(1)), xy, -x)
-    b = (xy, dr.fma(y * y, inverse, float_t(1)), -y)
-    return Frame(a, b, (x, y, z))
+class CameraRays(Protocol):
+    """What kernels ask of a camera, in device values. A camera model is a camera and one of these beside it.
+
+    Rays start at the origin of camera space. Attributes hold the image's size in pixels.
+    """
+
+    width: Any
+    height: Any
+
+    def frame(self, column: Any, row: Any) -> Frame:
+        """Frame of the ray of a pixel; explicit fma, so that every kernel rounds alike."""
+        ...
+
+    def pixel_range(self, backend: Backend, points: list[list[Any]]) -> tuple[tuple[Any, Any], tuple[Any, Any], Any]:
+        """Pixels that may see the convex hull of some points in camera space: rather too many than too few.
+
+        Returns:
+            First and last column, first and last row, and whether there are any.
+        """
+        ...
 
 
-def lane_count(camera: Camera) -> int:
+def largest_coordinate(points: list[list[Any]]) -> Any:
+    """Greatest coordinate of some points."""
+    size = type(points[0][0])(0)
+    for point in points:
+        for value in point:
+            size = dr.fmax(size, dr.abs(value))
+    return size
+
+
+def rounding_of(size: Any) -> Any:
+    """By how much, at most, a ray's frame moves points of which ``size`` is the greatest coordinate."""
+    return 16.0 * dr.epsilon(size) * size
+
+
+def lane_count(width: int, height: int) -> int:
     """Number of kernel lanes for an image: its size rounded up to whole blocks."""
     block = 1 << _BLOCK_BITS
-    return -(-camera.width // block) * -(-camera.height // block) * block * block
+    return -(-width // block) * -(-height // block) * block * block
 
 
-def lane_pixel(pinhole: Pinhole, lane: Any) -> tuple[Any, Any, Any]:
+def lane_pixel(image: CameraRays, lane: Any) -> tuple[Any, Any, Any]:
     """Column, row and validity of a lane: neighbouring lanes see neighbouring pixels, so rays share cells in cache."""
     mask = (1 << _BLOCK_BITS) - 1
-    blocks_per_row = (pinhole.width + mask) >> _BLOCK_BITS
+    blocks_per_row = (image.width + mask) >> _BLOCK_BITS
     block = lane >> (2 * _BLOCK_BITS)
     block_row = block // blocks_per_row
     block_column = block - block_row * blocks_per_row
     column = (block_column << _BLOCK_BITS) + _even_bits(lane)
     row = (block_row << _BLOCK_BITS) + _even_bits(lane >> 1)
-    return column, row, (column < pinhole.width) & (row < pinhole.height)
+    return column, row, (column < image.width) & (row < image.height)
 
 
-def pixel_lane(pinhole: Pinhole, column: Any, row: Any) -> Any:
+def pixel_lane(image: CameraRays, column: Any, row: Any) -> Any:
     """The lane of a pixel: the inverse of :func:`lane_pixel`."""
     mask = (1 << _BLOCK_BITS) - 1
-    blocks_per_row = (pinhole.width + mask) >> _BLOCK_BITS
+    blocks_per_row = (image.width + mask) >> _BLOCK_BITS
     block = (row >> _BLOCK_BITS) * blocks_per_row + (column >> _BLOCK_BITS)
     return (block << (2 * _BLOCK_BITS)) + _spread_bits(column & mask) + (_spread_bits(row & mask) << 1)
 

@@ -1,6 +1,6 @@
 """What does each format of mesh files look like?
 
-A file a format, named after it.
+A file a format, named after it; `table` says which suffix is whose.
 """
 
 import lazy_loader

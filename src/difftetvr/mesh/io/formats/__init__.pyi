@@ -3,9 +3,10 @@ from . import gmsh as gmsh
 from . import medit as medit
 from . import npz as npz
 from . import ovm as ovm
+from . import table as table
 from . import tetgen as tetgen
 from . import through_meshio as through_meshio
 from . import vtk as vtk
 from . import xdmf as xdmf
 
-__all__ = ["bintet", "gmsh", "medit", "npz", "ovm", "tetgen", "through_meshio", "vtk", "xdmf"]
+__all__ = ["bintet", "gmsh", "medit", "npz", "ovm", "table", "tetgen", "through_meshio", "vtk", "xdmf"]

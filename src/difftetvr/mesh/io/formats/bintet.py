@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from difftetvr.errors import MeshError
-from difftetvr.mesh.io.content import Content, damaged, split_rgba, tetra_block
+from difftetvr.mesh.io.content import Content, Output, damaged, split_rgba, tetra_block
 from difftetvr.mesh.io.source import Source
 
 
@@ -54,19 +54,16 @@ def read(path: Path) -> Content:
     )
 
 
-def write(path: Path, vertices: np.ndarray, tets: np.ndarray, rgba: np.ndarray | None, per_cell: bool) -> None:
+def write(path: Path, output: Output) -> None:
     """Write a .bintet file: version 2 where colours belong to cells, else version 1.
 
     Args:
         path: The file to write.
-        vertices: (V, 3) positions.
-        tets: (T, 4) vertex indices.
-        rgba: (V, 4) or (T, 4) red, green, blue, density; None where there are none.
-        per_cell: Whether they belong to the cells.
+        output: The mesh, and the field's arrays.
     """
-    none = np.empty((0, 4))
-    colors = none if rgba is None else rgba
-    arrays = [(tets.reshape(-1, 1), "<u4"), (vertices, "<f4"), (none if per_cell else colors, "<f4")]
+    none, per_cell = np.empty((0, 4)), output.is_per_cell
+    colors = none if output.rgba is None else output.rgba
+    arrays = [(output.tets.reshape(-1, 1), "<u4"), (output.vertices, "<f4"), (none if per_cell else colors, "<f4")]
     if per_cell:
         arrays.append((colors, "<f4"))
     with open(path, "wb") as file:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from difftetvr.errors import MeshError
-from difftetvr.mesh.io.content import Content, require_array, tetra_block
+from difftetvr.mesh.io.content import Content, Output, require_array, tetra_block
 
 _VERTICES = ("vertices", "points")
 _TETS = ("tets", "cells")
@@ -66,13 +66,16 @@ def is_mesh_archive(path: Path) -> bool:
         return False
 
 
-def write(path: Path, arrays: dict[str, Any]) -> None:
+def write(path: Path, output: Output) -> None:
     """Write an archive.
 
     Args:
         path: The file to write.
-        arrays: Its arrays by name.
+        output: The mesh, and the field's arrays.
     """
+    arrays: dict[str, Any] = {"vertices": output.vertices, "tets": output.tets, **output.arrays}
+    if output.arrays:
+        arrays["location"] = np.array("cell" if output.is_per_cell else "vertex")
     with open(path, "wb") as file:
         np.savez_compressed(file, **arrays)
 

@@ -15,6 +15,7 @@ import numpy as np
 from difftetvr.errors import MeshError
 from difftetvr.mesh.io.content import (
     Content,
+    Output,
     all_digits,
     as_indices,
     damaged,
@@ -69,17 +70,15 @@ def read(path: Path) -> Content:
     return Content(vertices, (tetra_block(tets),), data["vprop"], data["cprop"])
 
 
-def write(path: Path, vertices: np.ndarray, tets: np.ndarray, rgba: np.ndarray | None, per_cell: bool) -> None:
+def write(path: Path, output: Output) -> None:
     """Write an .ovm file; numbers have all digits that it takes to read the same ones again.
 
     Args:
         path: The file to write.
-        vertices: (V, 3) positions.
-        tets: (T, 4) vertex indices of cells with positive volume.
-        rgba: (V, 4) or (T, 4) red, green, blue, density; None where there are none.
-        per_cell: Whether they belong to the cells.
+        output: The mesh, and the field's arrays.
     """
-    corners = tets.astype(np.int64)[:, LOCAL_FACES].reshape(-1, 3)
+    vertices, rgba = output.vertices, output.rgba
+    corners = output.tets.astype(np.int64)[:, LOCAL_FACES].reshape(-1, 3)
     order = corners.argsort(1)
     low, middle, high = np.take_along_axis(corners, order, 1).T
     # One number for each pair: numpy finds equal numbers much faster than equal rows.
@@ -101,7 +100,7 @@ def write(path: Path, vertices: np.ndarray, tets: np.ndarray, rgba: np.ndarray |
             write_table(file, table, size + all_digits(table))
         if rgba is not None:
             kind = "vec4d" if rgba.dtype.itemsize == 8 else "vec4f"
-            file.write(f'CProp {kind} "cellColors"\n' if per_cell else f'VProp {kind} "vertexColors"\n')
+            file.write(f'CProp {kind} "cellColors"\n' if output.is_per_cell else f'VProp {kind} "vertexColors"\n')
             write_table(file, rgba, all_digits(rgba))
 
 

@@ -11,9 +11,11 @@ from pathlib import Path
 import numpy as np
 
 from difftetvr.errors import MeshError
+from difftetvr.files import atomic_write
 from difftetvr.mesh.io.content import (
     CellBlock,
     Content,
+    Output,
     all_digits,
     as_indices,
     damaged,
@@ -69,22 +71,20 @@ def read(path: Path) -> Content:
     return Content(rows[:, 1:4], (block,), point_data, _attributes(cells[:, 1 + size :], names))
 
 
-def write(
-    node: Path, ele: Path, mesh: tuple[np.ndarray, np.ndarray], rgba: np.ndarray | None = None, per_cell: bool = False
-) -> None:
+def write(path: Path, output: Output) -> None:
     """Write a pair of files; numbers have all digits that it takes to read the same ones again.
 
     Args:
-        node: The file of vertices to write.
-        ele: The file of tetrahedra to write.
-        mesh: (V, 3) positions and (T, 4) vertex indices.
-        rgba: (V, 4) or (T, 4) red, green, blue, density; None where there are none.
-        per_cell: Whether they belong to the cells.
+        path: The one of the pair to write; the other appears beside ``output.path``, whole or not at all.
+        output: The mesh, and the field's arrays.
     """
-    vertices, tets = mesh
-    on_vertices, on_cells = (None, rgba) if per_cell else (rgba, None)
-    _write_table(node, f"{len(vertices)} 3 {{}} 0", vertices, on_vertices)
-    _write_table(ele, f"{len(tets)} 4 {{}}", tets, on_cells)
+    node, ele = files(output.path)
+    is_node = output.path == node
+    with atomic_write(ele if is_node else node, MeshError) as partner:
+        node, ele = (path, partner) if is_node else (partner, path)
+        on_vertices, on_cells = (None, output.rgba) if output.is_per_cell else (output.rgba, None)
+        _write_table(node, f"{len(output.vertices)} 3 {{}} 0", output.vertices, on_vertices)
+        _write_table(ele, f"{len(output.tets)} 4 {{}}", output.tets, on_cells)
 
 
 def _write_table(path: Path, header: str, values: np.ndarray, rgba: np.ndarray | None) -> None:

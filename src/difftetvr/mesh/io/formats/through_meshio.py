@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from difftetvr.errors import MeshError
-from difftetvr.mesh.io.content import CellBlock, Content, damaged
+from difftetvr.mesh.io.content import CellBlock, Content, Output, damaged
 
 _WRITERS: dict[str, tuple[str, dict[str, Any]]] = {
     ".vtu": ("vtu", {"binary": True, "compression": "zlib"}),
@@ -22,9 +22,6 @@ _WRITERS: dict[str, tuple[str, dict[str, Any]]] = {
     ".mesh": ("medit", {}),
 }
 """Format name and options of meshio by suffix."""
-
-SUFFIXES = tuple(_WRITERS)
-"""Suffixes of the formats that `write` writes."""
 
 _PIECE = re.compile(rb"<Piece\b")
 _COMPRESSOR = re.compile(rb"""<VTKFile\b[^>]*\bcompressor\s*=\s*["'](\w+)["']""")
@@ -79,21 +76,18 @@ def read_xdmf(path: Path) -> Content:
     return _content(path, lambda: GuardedReader(path).read())
 
 
-def write(path: Path, suffix: str, vertices: np.ndarray, tets: np.ndarray, data: dict[str, dict[str, Any]]) -> None:
-    """Write a tetrahedral mesh with its data.
+def write(path: Path, output: Output) -> None:
+    """Write a tetrahedral mesh with its data in the format that the suffix of ``output.path`` names.
 
     Args:
         path: The file to write.
-        suffix: Names the format; one of `SUFFIXES`.
-        vertices: (V, 3) positions.
-        tets: (T, 4) vertex indices.
-        data: "point_data" and "cell_data", arrays by name.
+        output: The mesh, and the field's arrays.
     """
     import meshio
 
-    file_format, options = _WRITERS[suffix]
-    cell_data = {name: [values] for name, values in data["cell_data"].items()}
-    content = meshio.Mesh(vertices, [("tetra", tets)], point_data=data["point_data"], cell_data=cell_data)
+    file_format, options = _WRITERS[output.path.suffix.lower()]
+    cell_data = {name: [values] for name, values in output.cell_data.items()}
+    content = meshio.Mesh(output.vertices, [("tetra", output.tets)], point_data=output.point_data, cell_data=cell_data)
     with _quiet():
         content.write(str(path), file_format=file_format, **options)
 

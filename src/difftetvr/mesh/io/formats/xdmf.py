@@ -15,28 +15,27 @@ from meshio.xdmf.common import xdmf_to_numpy_type
 from meshio.xdmf.main import XdmfReader
 
 from difftetvr.errors import MeshError
-from difftetvr.mesh.io.content import all_digits, damaged, parse_numbers, write_table
+from difftetvr.mesh.io.content import Output, all_digits, damaged, parse_numbers, write_table
 
 _MOST_REFERENCES = 16
 _HEAD = '<?xml version="1.0"?>\n<Xdmf Version="3.0"><Domain><Grid Name="mesh" GridType="Uniform">\n'
 _TAIL = "</Grid></Domain></Xdmf>\n"
 
 
-def write(path: Path, vertices: np.ndarray, tets: np.ndarray, data: dict[str, dict[str, np.ndarray]]) -> None:
+def write(path: Path, output: Output) -> None:
     """Write a tetrahedral mesh with its data; numbers have all digits that it takes to read the same ones again.
 
     Args:
         path: The file to write.
-        vertices: (V, 3) positions.
-        tets: (T, 4) vertex indices.
-        data: "point_data" and "cell_data", arrays (N,) or (N, 3) by name.
+        output: The mesh, and the field's arrays.
     """
+    tets = output.tets
     with open(path, "w", encoding="ascii", newline="\n") as file:
         file.write(_HEAD)
-        _write_item(file, 'Geometry GeometryType="XYZ"', vertices)
+        _write_item(file, 'Geometry GeometryType="XYZ"', output.vertices)
         _write_item(file, f'Topology TopologyType="Tetrahedron" NumberOfElements="{len(tets)}"', tets)
-        for place, center in (("point_data", "Node"), ("cell_data", "Cell")):
-            for name, values in data[place].items():
+        for arrays, center in ((output.point_data, "Node"), (output.cell_data, "Cell")):
+            for name, values in arrays.items():
                 kind = "Scalar" if values.ndim == 1 else "Vector"
                 _write_item(file, f'Attribute Name="{name}" AttributeType="{kind}" Center="{center}"', values)
         file.write(_TAIL)

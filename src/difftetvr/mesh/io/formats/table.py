@@ -1,0 +1,56 @@
+"""Who reads and writes which file: one row for each suffix. A new format is a file beside this one and a row here."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from difftetvr.mesh.io.content import Content, Output
+from difftetvr.mesh.io.formats import bintet, gmsh, medit, npz, ovm, tetgen, through_meshio, vtk
+
+
+@dataclass(frozen=True)
+class Format:
+    """What is known about the files of one suffix.
+
+    Attributes:
+        read: From a file to its content.
+        write: From a mesh to a file; None for formats that are only read.
+        holds_field: Whether it holds colour and density beside the geometry.
+        holds_harmonics: Whether it holds what colours owe to the direction, too.
+        is_single: Whether it holds float32 only.
+    """
+
+    read: Callable[[Path], Content]
+    write: Callable[[Path, Output], None] | None = None
+    holds_field: bool = True
+    holds_harmonics: bool = False
+    is_single: bool = False
+
+
+def format_of(path: Path) -> Format:
+    """The format that a file's suffix names; one that only meshio may know where it is none of ours."""
+    return FORMATS.get(path.suffix.lower(), Format(through_meshio.read))
+
+
+def _write_xdmf(path: Path, output: Output) -> None:
+    # Late: it loads meshio and so every format that meshio knows.
+    importlib.import_module("difftetvr.mesh.io.formats.xdmf").write(path, output)
+
+
+FORMATS: dict[str, Format] = {
+    ".vtu": Format(through_meshio.read_vtu, through_meshio.write, holds_harmonics=True),
+    ".vtk": Format(vtk.read, through_meshio.write),
+    ".msh": Format(gmsh.read, through_meshio.write),
+    ".xdmf": Format(through_meshio.read_xdmf, _write_xdmf),
+    ".xmf": Format(through_meshio.read_xdmf),
+    ".npz": Format(npz.read, npz.write, holds_harmonics=True),
+    ".bintet": Format(bintet.read, bintet.write, is_single=True),
+    ".ovm": Format(ovm.read, ovm.write),
+    ".node": Format(tetgen.read, tetgen.write),
+    ".ele": Format(tetgen.read, tetgen.write),
+    ".mesh": Format(medit.read, through_meshio.write, holds_field=False),
+}
+"""Formats by suffix; those that are written are offered in this order."""
