@@ -9,7 +9,6 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
-from typing import get_args
 
 import pytest
 
@@ -72,25 +71,24 @@ def shown_commands() -> list:
 
 @pytest.mark.parametrize("words", shown_commands())
 def test_commands_can_be_given_as_shown(words, tmp_path, monkeypatch, capsys):
-    from difftetvr import cli
+    from difftetvr.cli import command_type, parse_command
 
     monkeypatch.chdir(tmp_path)
     if "--config" in words:
         config = Path(words[words.index("--config") + 1])
         config.parent.mkdir(parents=True)
         config.write_text(json.dumps({"capture": "tooth"}))
-    ran = []
-    for command in get_args(cli.Command):
-        monkeypatch.setattr(get_args(command)[0], "run", lambda self, console: ran.append(self))
-    assert cli.main(words) == 0, capsys.readouterr().err
-    assert len(ran) == 1
+    try:
+        command = parse_command(words)
+    except SystemExit:
+        pytest.fail(capsys.readouterr().err)
+    assert isinstance(command, command_type(words[0]))
 
 
 def test_every_command_is_in_the_table_of_commands():
-    from difftetvr.cli import Command
+    from difftetvr.cli import COMMANDS
 
-    names = {annotation.name for command in get_args(Command) for annotation in command.__metadata__}
-    assert names == set(re.findall(r"^\| `(\w+) ", TEXTS["docs/command-line.md"], re.MULTILINE))
+    assert set(COMMANDS) == set(re.findall(r"^\| `(\w+)[ `]", TEXTS["docs/command-line.md"], re.MULTILINE))
 
 
 def test_every_name_can_be_reached_from_the_package():

@@ -4,7 +4,6 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
-from typing import get_args
 
 from docutils import nodes
 from docutils.parsers.rst import Directive
@@ -15,9 +14,9 @@ _COLUMNS = "88"
 
 def commands() -> list[str]:
     """Names of the program's commands, in its order."""
-    from difftetvr.cli import Command
+    from difftetvr.cli import COMMANDS
 
-    return [annotation.name for command in get_args(Command) for annotation in command.__metadata__]
+    return list(COMMANDS)
 
 
 def help_of(command: str) -> str:
