@@ -38,7 +38,8 @@ lint: setup
 bench: setup
 	@for script in $(BENCHMARKS); do echo "== $$script"; $(BIN)/python "$$script" || exit 1; done
 
-# Warnings are errors. The doctrees and the gallery stay, so that the next time only what changed is made.
+# Warnings are errors. The next time only pages are made that changed, and only examples run that changed themselves:
+# after changes of the package, `make clean docs` runs them all.
 docs:
 	@sh scripts/setup.sh docs
 	$(BIN)/python -m sphinx -W --keep-going -n -q -b html -d docs/_build/doctrees docs docs/_build/html

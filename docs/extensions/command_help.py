@@ -6,8 +6,8 @@ import sys
 from collections.abc import Iterator
 
 from docutils import nodes
-from docutils.parsers.rst import Directive
 from sphinx.application import Sphinx
+from sphinx.util.docutils import SphinxDirective
 
 _COLUMNS = "88"
 
@@ -28,11 +28,13 @@ def help_of(command: str) -> str:
     return "\n".join(part.rstrip() for part in done.stdout.strip().splitlines())
 
 
-class CommandHelp(Directive):
+class CommandHelp(SphinxDirective):
     """A section for each command."""
 
     def run(self) -> list[nodes.Node]:
         """The sections."""
+        # The program may have changed where the page has not: it is read anew every time.
+        self.env.note_reread()
         return list(self._sections())
 
     def _sections(self) -> Iterator[nodes.Node]:
