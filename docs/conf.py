@@ -38,6 +38,7 @@ suppress_warnings = ["config.cache"]  # the gallery's functions are named, not s
 
 # ---- the reference, from docstrings
 
+smartquotes = False  # options keep their two hyphens
 default_role = "py:obj"
 add_module_names = False
 autodoc_default_options = {"members": True}
