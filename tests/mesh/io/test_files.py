@@ -237,6 +237,10 @@ def test_failed_save_leaves_the_old_file(tmp_path, monkeypatch):
     assert [p.name for p in tmp_path.iterdir()] == ["a.vtu"]
 
 
+CLOSES_ARCHIVES = pytest.mark.skipif(
+    np.lib.NumpyVersion(np.__version__) < "2.2.0", reason="older numpy also complains of the archive it leaves open"
+)
+
 FULL_DISK = """
 import resource, sys
 from pathlib import Path
@@ -252,7 +256,7 @@ except MeshError as error:
 
 
 @pytest.mark.skipif(os.name != "posix", reason="limits on the size of files are those of POSIX")
-@pytest.mark.parametrize("suffix", [".vtu", ".vtk", ".msh", ".npz"])
+@pytest.mark.parametrize("suffix", [".vtu", ".vtk", ".msh", pytest.param(".npz", marks=CLOSES_ARCHIVES)])
 def test_files_that_stop_growing_tell_why(tmp_path, suffix):
     """A limit on the size of files stands for a full disk: numpy, which counts what it wrote, knows neither."""
     mesh = TetMesh.grid((12, 12, 12))
