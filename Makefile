@@ -5,7 +5,7 @@ BIN := .venv/bin
 # Which scripts `make bench` runs; the studies of the Tooth and of photographs have commands of their own.
 BENCHMARKS ?= $(filter-out benchmarks/tooth%.py benchmarks/photos.py,$(wildcard benchmarks/*.py))
 
-# Tests run in one process for each core, up to four: more take memory, as each loads PyTorch, and gain little.
+# Tests run in one process for each core, up to four: each loads PyTorch and compiles kernels of its own.
 PYTEST := $(BIN)/python -m pytest -q --durations=10 -n auto --maxprocesses=4 --dist worksteal
 
 .PHONY: help setup demo test test-all lint bench clean distclean
