@@ -8,7 +8,8 @@ import difftetvr.cli as cli
 LOOP = importlib.import_module("difftetvr.fitting.loop")
 TRAINER = importlib.import_module("difftetvr.fitting.trainer")
 VIEWS = ["--views", "10", "--width", "24", "--height", "24"]
-FIT = ["--cells", "500", "--iterations", "4", "--device", "cpu"]
+FEW_ROUNDS = ["--exchange.rounds", "1", "--exchange.views", "3"]
+FIT = ["--cells", "500", "--iterations", "4", *FEW_ROUNDS, "--device", "cpu"]
 
 
 def fails(capsys, *args):

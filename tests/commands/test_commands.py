@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -194,9 +193,8 @@ def test_interrupt_saves_a_checkpoint_and_leaves_with_130(tmp_path):
         [sys.executable, "-c", code, *args], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     )
     try:
-        first = process.stdout.readline()
-        assert "loss" in first, first
-        time.sleep(0.2)
+        lines = iter(process.stdout.readline, "")  # on a busy machine it first says that it makes the mesh
+        assert any("loss" in line for line in lines)
         os.kill(process.pid, signal.SIGINT)
         rest, _ = process.communicate(timeout=60)
     finally:

@@ -14,12 +14,16 @@ from difftetvr.fitting import FitConfig, fit
 from difftetvr.fitting.parameters import FieldParameters
 from difftetvr.fitting.records.checkpoint import Checkpoint
 from difftetvr.fitting.records.evaluation import evaluate, true_image
+from difftetvr.fitting.refinement import Exchange, Grow
 from difftetvr.fitting.trainer import Trainer
 from difftetvr.mesh import TetMesh
 
-SMALL = FitConfig(cells=2_000, iterations=40, evaluate_every=20, device="cpu")
+FEW_ROUNDS = Exchange(rounds=5, views=3)
+"""A round costs as much as ten other iterations."""
 
-TINY = FitConfig(cells=500, iterations=3, device="cpu")
+SMALL = FitConfig(cells=2_000, iterations=40, evaluate_every=20, device="cpu", exchange=FEW_ROUNDS)
+
+TINY = FitConfig(cells=500, iterations=3, device="cpu", exchange=FEW_ROUNDS)
 
 
 def assert_same_result(a, b):
@@ -261,7 +265,8 @@ def test_damaged_checkpoint_is_one_sentence(small_capture, tmp_path, content):
     ],
 )
 def test_options_learn_too(small_capture, options):
-    config = FitConfig(cells=1_000, iterations=16, evaluate_every=0, device="cpu", **options)
+    rounds = {"exchange": FEW_ROUNDS, "grow": Grow(rounds=5, views=3)}
+    config = FitConfig(cells=1_000, iterations=16, evaluate_every=0, device="cpu", **rounds, **options)
     result = fit(small_capture, config)
     assert sum(result.history.loss[-4:]) < 0.8 * sum(result.history.loss[:4])
     assert result.field.location_on(result.mesh) == config.location

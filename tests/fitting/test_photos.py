@@ -84,13 +84,14 @@ def room(shiny: dtv.Capture) -> dtv.Capture:
 def test_nothing_is_put_before_the_cameras(room: dtv.Capture, start: str) -> None:
     points = torch.nn.functional.normalize(torch.randn(200, 3, generator=torch.Generator().manual_seed(2)), dim=1)
     capture = dataclasses.replace(room, points=0.9 * points)
-    options = FAST | {"cells": 4000, "iterations": 60, "start": start, "exchange": Exchange(rounds=6, until=0.5)}
+    exchange = Exchange(rounds=6, views=3, until=0.5)
+    options = FAST | {"cells": 3000, "iterations": 30, "start": start, "exchange": exchange}
     config = dtv.FitConfig(**options, harmonics=0)
     assert config.for_capture(capture).free_space == 0.8 and config.for_capture(room).free_space == 0.5
     assert config.for_capture(dataclasses.replace(capture, surroundings=1.0)).free_space == 0.0
     trainer = Trainer(capture, config)
     space = capture.free_space(0.8)
-    for _ in range(60):
+    for _ in range(30):
         due = trainer.strategy.is_due(trainer._moment())
         trainer.step()
         if due:
@@ -99,7 +100,7 @@ def test_nothing_is_put_before_the_cameras(room: dtv.Capture, start: str) -> Non
     is_free = trainer.parameters.is_free
     assert int(is_free.sum()) > 30 and trainer.history.refinements
     assert (trainer.parameters.detached_field().density[is_free] == 0.0).all()
-    foggy = dtv.fit(capture, dataclasses.replace(config, free_space=0.0))
+    foggy = dtv.fit(capture, dataclasses.replace(config, free_space=0.0, refine="none"))
     assert float(foggy.field.density[space.contains(foggy.mesh.vertices)].mean()) > 0.0
 
 
@@ -120,7 +121,7 @@ def test_free_space_empties_an_initial_field(room: dtv.Capture) -> None:
 @pytest.mark.parametrize("name", ["shiny", "room"])
 def test_resuming_gives_the_same_bits(name: str, tmp_path, request) -> None:  # type: ignore[no-untyped-def]
     capture = request.getfixturevalue(name)
-    options = FAST | {"cells": 4000, "iterations": 30, "exchange": Exchange(rounds=3)}
+    options = FAST | {"cells": 3000, "iterations": 16, "exchange": Exchange(rounds=3, views=3)}
     config = dtv.FitConfig(harmonics=2, **options)
 
     def advance(trainer: Trainer, count: int) -> Trainer:
@@ -128,11 +129,11 @@ def test_resuming_gives_the_same_bits(name: str, tmp_path, request) -> None:  # 
             trainer.step()
         return trainer
 
-    whole = advance(Trainer(capture, config), 30)
+    whole = advance(Trainer(capture, config), 16)
     assert whole.history.refinements
-    half = advance(Trainer(capture, config), 14)
+    half = advance(Trainer(capture, config), 7)
     half.checkpoint().save(tmp_path / "half.safetensors")
-    again = advance(Trainer.resume(capture, config, Checkpoint.load(tmp_path / "half.safetensors")), 16)
+    again = advance(Trainer.resume(capture, config, Checkpoint.load(tmp_path / "half.safetensors")), 9)
     expected, found = whole.checkpoint().tensors, again.checkpoint().tensors
     assert expected.keys() == found.keys() and "harmonics.exp_avg" in expected
     assert bool(expected["is_free"].any()) == (name == "room")
@@ -145,7 +146,7 @@ def test_masked_pixels_do_not_count(shiny: dtv.Capture) -> None:
     valid = torch.ones(shiny.images.shape[:3], dtype=torch.bool)
     valid[:, 8:14, 6:20] = False
     wrong = torch.where(valid[..., None], shiny.images, 0.9)
-    options = FAST | {"iterations": 20, "exchange": Exchange(rounds=2)}
+    options = FAST | {"iterations": 12, "exchange": Exchange(rounds=2, views=3)}
     results = []
     for images in (shiny.images, wrong):
         capture = dataclasses.replace(shiny, images=images, valid=valid, alphas=None)

@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypotheses import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 from difftetvr import TetMesh
@@ -12,7 +13,7 @@ from difftetvr.fitting.regularizers import shape_barrier
 from difftetvr.mesh.changes.bisection import bisect_edges
 from difftetvr.mesh.limits import MotionLimits
 
-properties = settings(max_examples=25, deadline=None)
+properties = examples(25)
 seeds = st.integers(0, 2**32 - 1)
 boundaries = st.sampled_from(["fixed", "slide"])
 

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypotheses import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 from difftetvr.errors import MeshError
@@ -22,7 +23,7 @@ def determinants(vertices, tets):
     return torch.linalg.det(corners[:, 1:] - corners[:, :1])
 
 
-@settings(max_examples=30, deadline=None)
+@examples(30)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_any_vertex_order_becomes_positive_and_keeps_cells_and_neighbours(seed):
     rng = np.random.default_rng(seed)

@@ -2,10 +2,12 @@
 
 Positions and fields are float32 values, so that float32 and float64 renderings start from the same numbers. Each scene
 is drawn from its own seed. Cameras outside a mesh are placed at random, so that no ray meets an edge exactly.
+Scenes and their reference images are made once and shared, so nothing may write to them.
 """
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from collections.abc import Callable
@@ -20,7 +22,7 @@ from torch import Tensor
 from difftetvr.rendering.cameras.pinhole import Camera
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Scene:
     """A mesh with a field, and a camera that looks at it.
 
@@ -44,21 +46,18 @@ class Scene:
 
     def oracle(self, nudge: tuple[float, float] = (0.0, 0.0)) -> OracleImage:
         """The reference image."""
-        return render_oracle(
-            self.vertices,
-            self.tets,
-            self.color,
-            self.density,
-            self.camera,
-            self.background,
-            self.per_cell,
-            nudge,
-        )
+        return _reference(self, nudge)
 
     @property
     def size(self) -> float:
         """Diagonal of the mesh's bounding box."""
         return float((self.vertices.amax(0) - self.vertices.amin(0)).double().norm())
+
+
+@functools.lru_cache(maxsize=100)
+def _reference(scene: Scene, nudge: tuple[float, float]) -> OracleImage:
+    fields = scene.color, scene.density, scene.camera, scene.background
+    return render_oracle(scene.vertices, scene.tets, *fields, scene.per_cell, nudge)
 
 
 # ---------------------------------------------------------------------------------------------------------- meshes
@@ -196,6 +195,10 @@ def scaled(scene: Scene, scale: float, shift: tuple[float, float, float] = (0.0,
 # ------------------------------------------------------------------------------------------------------- the scenes
 
 
+def _once(scenes: dict[str, Callable[[], Scene]]) -> dict[str, Callable[[], Scene]]:
+    return {name: functools.cache(make) for name, make in scenes.items()}
+
+
 def _delaunay(**options: bool) -> Scene:
     return make_scene(delaunay_ball(150, 1), random_camera(1), 1, **options)
 
@@ -286,42 +289,46 @@ def _speck() -> Scene:
     return make_scene(delaunay_ball(200, 15), random_camera(15, 8.0, (8, 8), fov_y=0.5), 15)
 
 
-SCENES: dict[str, Callable[[], Scene]] = {
-    "delaunay": _delaunay,
-    "grid": _grid,
-    "jittered": _jittered,
-    "porous": _porous,
-    "inside": _inside,
-    "in-hole": _in_hole,
-    "components": _components,
-    "beside": _beside,
-    "wide-fov": _wide,
-    "off-centre": _off_centre,
-    "half-empty": _half_empty,
-    "dense-1e2": lambda: _dense(1e2),
-    "single": _single,
-    "slabs": _slabs,
-    "speck": _speck,
-    "delaunay-cells": lambda: _delaunay(per_cell=True, background=True),
-    "grid-cells": lambda: _grid(per_cell=True),
-    "porous-cells": lambda: _porous(per_cell=True, background=True),
-    "inside-cells": lambda: _inside(per_cell=True),
-    "in-hole-cells": lambda: _in_hole(per_cell=True),
-    "components-cells": lambda: _components(per_cell=True),
-}
+SCENES: dict[str, Callable[[], Scene]] = _once(
+    {
+        "delaunay": _delaunay,
+        "grid": _grid,
+        "jittered": _jittered,
+        "porous": _porous,
+        "inside": _inside,
+        "in-hole": _in_hole,
+        "components": _components,
+        "beside": _beside,
+        "wide-fov": _wide,
+        "off-centre": _off_centre,
+        "half-empty": _half_empty,
+        "dense-1e2": lambda: _dense(1e2),
+        "single": _single,
+        "slabs": _slabs,
+        "speck": _speck,
+        "delaunay-cells": lambda: _delaunay(per_cell=True, background=True),
+        "grid-cells": lambda: _grid(per_cell=True),
+        "porous-cells": lambda: _porous(per_cell=True, background=True),
+        "inside-cells": lambda: _inside(per_cell=True),
+        "in-hole-cells": lambda: _in_hole(per_cell=True),
+        "components-cells": lambda: _components(per_cell=True),
+    }
+)
 """Scenes with a smooth enough image for both values and gradients to be compared."""
 
-EXTREME_SCENES: dict[str, Callable[[], Scene]] = {
-    "empty": _empty,
-    "dense-1e4": lambda: _dense(1e4),
-    "dense-1e6": lambda: _dense(1e6),
-    "behind": _behind,
-    "out-of-view": _out_of_view,
-    "one-pixel": lambda: make_scene(delaunay_ball(60, 16), random_camera(16, size=(1, 1)), 16),
-    "one-row": lambda: make_scene(delaunay_ball(60, 17), random_camera(17, size=(70, 1), fov_y=0.02), 17),
-    "one-column": lambda: make_scene(delaunay_ball(60, 18), random_camera(18, size=(1, 70)), 18),
-    "over-a-block": lambda: make_scene(delaunay_ball(30, 19), random_camera(19, size=(67, 65)), 19),
-}
+EXTREME_SCENES: dict[str, Callable[[], Scene]] = _once(
+    {
+        "empty": _empty,
+        "dense-1e4": lambda: _dense(1e4),
+        "dense-1e6": lambda: _dense(1e6),
+        "behind": _behind,
+        "out-of-view": _out_of_view,
+        "one-pixel": lambda: make_scene(delaunay_ball(60, 16), random_camera(16, size=(1, 1)), 16),
+        "one-row": lambda: make_scene(delaunay_ball(60, 17), random_camera(17, size=(70, 1), fov_y=0.02), 17),
+        "one-column": lambda: make_scene(delaunay_ball(60, 18), random_camera(18, size=(1, 70)), 18),
+        "over-a-block": lambda: make_scene(delaunay_ball(30, 19), random_camera(19, size=(67, 65)), 19),
+    }
+)
 """Scenes of which the image is compared, not the gradients."""
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -84,6 +85,7 @@ def gradients(scene: Scene, dtype: torch.dtype, weights: LossWeights | None = No
     return {name: _gradient(leaf) for name, leaf in leaves.items()}
 
 
+@functools.lru_cache(maxsize=100)
 def oracle_gradients(scene: Scene) -> tuple[LossWeights, dict[str, Tensor]]:
     """The random loss of a scene and its reference gradients."""
     leaves = leaves_of(scene, torch.float64, LEAVES)

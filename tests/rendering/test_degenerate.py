@@ -165,7 +165,7 @@ def kept_lengths(keep: np.ndarray, side: int, eye: np.ndarray, directions: np.nd
 @pytest.mark.parametrize("eye", [(4, 4, -8), (3.5, 5, -4), (4, 4, 4), (2, 3, 1), (0, 0, 0), (3, 4.5, 8)], ids=str)
 def test_lattice_rays_through_a_mesh_with_holes(eye: tuple[float, float, float]) -> None:
     """Rays that run in the surfaces and along the edges of holes may count them or not; all others must be exact."""
-    side, density, pixels = 8, 0.1, 49
+    side, density, pixels = 8, 0.1, 33
     vertices, cells = kuhn_grid((side, side, side), 0.0, float(side))
     rng = np.random.default_rng(3)
     keep = np.repeat(rng.random(side**3) > 0.35, 6) & (rng.random(len(cells)) > 0.1)

@@ -131,7 +131,7 @@ def test_only_what_requires_gradients_gets_them(wanted: tuple[str, ...]) -> None
 
 def _tiny(kind: str, per_cell: bool) -> Scene:
     eye = {"outside": None, "inside": (0.05, 0.02, -0.04)}[kind]
-    camera = random_camera(50, 1.1, (6, 5)) if eye is None else camera_at(eye, 50, (6, 5), 1.4)
+    camera = random_camera(50, 1.1, (4, 3)) if eye is None else camera_at(eye, 50, (4, 3), 1.4)
     return make_scene(jittered_grid((2, 1, 1), 0.12, 50), camera, 50, per_cell=per_cell, background=True)
 
 

@@ -71,7 +71,7 @@ def sliced(mesh: TetMesh, field: ScalarField, camera: Camera, pieces: int) -> to
 
 def test_against_fine_sampling() -> None:
     scene = SCENES["delaunay"]()
-    camera = scene.camera.with_size(12, 10)
+    camera = scene.camera.with_size(8, 7)
     mesh = mesh_of(scene)
     field = ScalarField(scalars_of(mesh), transfer_function(), 5.0, (0.0, 1.0))
     reference = sliced(mesh, field, camera, 400)

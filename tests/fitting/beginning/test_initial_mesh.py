@@ -10,6 +10,7 @@ import torch
 import difftetvr.cli as cli
 from difftetvr.errors import FitError, MeshError
 from difftetvr.fitting import FitConfig, fit
+from difftetvr.fitting.refinement import Exchange
 from difftetvr.fitting.trainer import Trainer
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.mesh.io import save
@@ -46,7 +47,9 @@ def flawed(grid, tmp_path):
 
 
 def options(path, **others):
-    return FitConfig(**{"initial_mesh": path, "iterations": 3, "device": "cpu", "refine": "none", **others})
+    few_rounds = Exchange(rounds=3, views=3)
+    given = {"initial_mesh": path, "iterations": 3, "device": "cpu", "refine": "none", "exchange": few_rounds}
+    return FitConfig(**{**given, **others})
 
 
 def test_a_run_begins_with_the_mesh_and_is_its_own_budget(small_capture, grid, plain):
@@ -147,7 +150,7 @@ def test_resuming_goes_on_to_the_same_bits_without_the_file(small_capture, flawe
 
 def test_the_command_prints_and_keeps_what_was_mended(flawed, tmp_path, capsys):
     folder = tmp_path / "out"
-    given = ["--initial-mesh", flawed, "--iterations", "2", "--device", "cpu", *VIEWS]
+    given = ["--initial-mesh", flawed, "--iterations", "2", "--exchange.rounds", "1", "--device", "cpu", *VIEWS]
     assert cli.main(["fit", "tooth", "-o", str(folder), *given]) == 2
     assert "--repair" in capsys.readouterr().err
     assert not folder.exists()

@@ -34,9 +34,10 @@ def state_of(trainer):
     return trainer.checkpoint().tensors
 
 
+@pytest.mark.parametrize("iterations", [10, pytest.param(14, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("refine", ["exchange", "grow", "star"])
-def test_killed_at_any_moment_it_goes_on_to_the_same_result(small_capture, tmp_path, refine):
-    config = config_for(refine)
+def test_killed_at_any_moment_it_goes_on_to_the_same_result(small_capture, tmp_path, refine, iterations):
+    config = dataclasses.replace(config_for(refine), iterations=iterations)
     path = tmp_path / "c.safetensors"
     straight = Trainer(small_capture, config)
     for iteration in range(config.steps):
@@ -54,11 +55,12 @@ def test_killed_at_any_moment_it_goes_on_to_the_same_result(small_capture, tmp_p
         assert result.history.loss == straight.history.loss
 
 
-def test_moving_and_refining_beats_a_fixed_grid_of_as_many_cells(small_capture):
-    config = FitConfig(cells=600, iterations=120, evaluate_every=0, device="cpu")
+@pytest.mark.parametrize(("cells", "rounds"), [(300, 20), pytest.param(600, None, marks=pytest.mark.slow)])
+def test_moving_and_refining_beats_a_fixed_grid_of_as_many_cells(small_capture, cells, rounds):
+    config = FitConfig(cells=cells, iterations=120, evaluate_every=0, device="cpu", exchange=Exchange(rounds=rounds))
     adaptive = fit(small_capture, config)
     uniform = fit(small_capture, dataclasses.replace(config, move=False, refine="none"))
-    assert adaptive.mesh.num_cells <= 600
+    assert adaptive.mesh.num_cells <= cells
     assert adaptive.metrics["train_psnr"] > uniform.metrics["train_psnr"] + 1.0
     assert adaptive.metrics["psnr"] > uniform.metrics["psnr"] + 0.5
     rebuilt = TetMesh(adaptive.mesh.vertices, adaptive.mesh.tets)

@@ -2,7 +2,8 @@
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypotheses import examples
+from hypothesis import given
 from mesh.changes.checks import SEEDS, cells_of, check_change, random_mesh
 
 from difftetvr.errors import MeshError
@@ -37,7 +38,7 @@ def greedy(mesh, order, budget=None):
     return chosen
 
 
-@settings(max_examples=40, deadline=None)
+@examples(40)
 @given(seed=SEEDS)
 def test_bisection_of_random_edges_in_a_row(seed):
     mesh = random_mesh(seed, torch.float64 if seed % 2 else torch.float32)
@@ -71,7 +72,7 @@ def test_what_bisection_does_to_one_edge():
     assert (values.grad[ends] == 0.5).all() and values.grad.sum() == 6.0
 
 
-@settings(max_examples=25, deadline=None)
+@examples(25)
 @given(seed=SEEDS)
 def test_independent_edges_are_those_of_the_greedy_loop(seed):
     mesh = random_mesh(seed)

@@ -6,7 +6,8 @@ from unittest import mock
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypotheses import examples
+from hypothesis import given
 from mesh.changes.checks import SEEDS, check_change, random_mesh
 from scipy.spatial import ConvexHull
 
@@ -47,7 +48,7 @@ def sphere(seed):
     return Topology(torch.from_numpy(cells).int(), len(points))
 
 
-@settings(max_examples=40, deadline=None)
+@examples(40)
 @given(seed=SEEDS)
 def test_link_condition_of_spheres_and_meshes(seed):
     topology = sphere(seed) if seed % 3 else random_mesh(seed).topology
@@ -137,7 +138,7 @@ def interior_mesh(seed):
     return mesh
 
 
-@settings(max_examples=8, deadline=None)
+@examples(8)
 @given(seed=SEEDS)
 def test_collapses_are_those_of_the_greedy_loop(seed):
     mesh = interior_mesh(seed)
@@ -160,7 +161,7 @@ def test_collapses_are_those_of_the_greedy_loop(seed):
         assert limit is None or mesh.num_cells - len(remaining) <= limit
 
 
-@settings(max_examples=5, deadline=None)
+@examples(5)
 @given(seed=SEEDS)
 def test_it_makes_no_difference_how_many_candidates_are_looked_at_together(seed):
     mesh = interior_mesh(seed)
@@ -187,7 +188,7 @@ def test_best_first_part_by_part(dtype):
         assert torch.equal(priority[together], priority.sort(descending=True).values)
 
 
-@settings(max_examples=10, deadline=None)
+@examples(10)
 @given(seed=SEEDS)
 def test_collapsing_in_a_row(seed):
     mesh = interior_mesh(seed).to(dtype=torch.float64 if seed % 2 else torch.float32)

@@ -6,7 +6,8 @@ Meshes have integer positions, of which the code under test sees affine images, 
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypotheses import examples
+from hypothesis import given
 from mesh.changes.checks import SEEDS, boundary_area, check_change
 
 from difftetvr.errors import MeshError
@@ -115,7 +116,7 @@ def merged(mesh, change):
     return torch.stack((before[moved], after[moved]), 1).unique(dim=0)
 
 
-@settings(max_examples=12, deadline=None)
+@examples(12)
 @given(seed=SEEDS)
 def test_the_boundary_stays_the_same_surface(seed):
     lattice = lattice_mesh(seed)
@@ -159,7 +160,7 @@ def is_right(mesh, points, removed, kept):
     return bool(lies_in_planes and (determinants(points, moved) > 0).all())
 
 
-@settings(max_examples=8, deadline=None)
+@examples(8)
 @given(seed=SEEDS)
 def test_a_boundary_vertex_goes_where_exact_arithmetic_lets_it(seed):
     mesh = lattice_mesh(seed)
@@ -173,7 +174,7 @@ def test_a_boundary_vertex_goes_where_exact_arithmetic_lets_it(seed):
         assert (change is not None) == is_right(mesh, points, removed, kept)
 
 
-@settings(max_examples=6, deadline=None)
+@examples(6)
 @given(seed=SEEDS)
 def test_collapses_done_together_are_those_done_one_by_one(seed):
     lattice = lattice_mesh(seed)
@@ -251,7 +252,7 @@ def test_a_curved_surface_stays_as_it_is():
     assert torch.isin(outer.nonzero()[:, 0], change.parents[:, 0]).all()
 
 
-@settings(max_examples=5, deadline=None)
+@examples(5)
 @given(seed=SEEDS)
 def test_flat_cells_in_a_rounded_surface(seed):
     """Rounding takes points off their plane, and the hull gets cells as thin as that: none may turn over."""
@@ -318,7 +319,7 @@ def test_the_rim_of_a_slit_stays():
     assert 5 < len(done) < len(changes)
 
 
-@settings(max_examples=6, deadline=None)
+@examples(6)
 @given(seed=SEEDS)
 def test_a_slit_does_not_close(seed):
     """Both its sides may lose their vertices, but not such that their faces become the same."""

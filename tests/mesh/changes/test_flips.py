@@ -5,7 +5,8 @@ import itertools
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypotheses import examples
+from hypothesis import given
 from mesh.changes.checks import SEEDS, cells_of, check_change, random_mesh
 
 from difftetvr.errors import MeshError
@@ -99,7 +100,7 @@ def interpolate(mesh, values, points):
     return torch.einsum("pk,pkc->pc", weights[rows, cells], values[mesh.tets[cells].long()])
 
 
-@settings(max_examples=10, deadline=None)
+@examples(10)
 @given(seed=SEEDS)
 def test_every_possible_flip_is_found_and_no_other(seed):
     mesh = random_mesh(seed, torch.float64 if seed % 2 else torch.float32)
@@ -127,7 +128,7 @@ def test_no_flip_makes_a_flat_cell_whatever_the_floor():
         assert found == possible_flips(lattice, -1.0).keys() and found
 
 
-@settings(max_examples=12, deadline=None)
+@examples(12)
 @given(seed=SEEDS)
 def test_flips_of_random_priority_in_a_row(seed):
     mesh = random_mesh(seed, torch.float64 if seed % 2 else torch.float32)
@@ -162,7 +163,7 @@ def test_flips_of_random_priority_in_a_row(seed):
         mesh = new
 
 
-@settings(max_examples=15, deadline=None)
+@examples(15)
 @given(seed=SEEDS)
 def test_flips_are_those_of_the_greedy_loop(seed):
     mesh = random_mesh(seed)
@@ -180,7 +181,7 @@ def test_flips_are_those_of_the_greedy_loop(seed):
     assert set(independent_flips(flips, priority).cells.unique().tolist()) - {-1} == used
 
 
-@settings(max_examples=6, deadline=None)
+@examples(6)
 @given(seed=SEEDS)
 def test_every_flip_can_be_taken_back(seed):
     mesh = random_mesh(seed)
@@ -201,7 +202,7 @@ def test_every_flip_can_be_taken_back(seed):
             assert torch.allclose(one.surplus(values), -undone.surplus(values), atol=1e-9)
 
 
-@settings(max_examples=12, deadline=None)
+@examples(12)
 @given(seed=SEEDS)
 def test_the_surplus_is_the_change_of_the_interpolated_value(seed):
     mesh = random_mesh(seed, torch.float64 if seed % 2 else torch.float32)
@@ -278,7 +279,7 @@ def test_what_is_there_already_is_not_made_again():
         check_change(flips.mesh, change, keeps_cells=False)
 
 
-@settings(max_examples=10, deadline=None)
+@examples(10)
 @given(seed=SEEDS)
 def test_closed_rings_are_the_cells_in_order(seed):
     mesh = random_mesh(seed)

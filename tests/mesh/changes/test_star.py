@@ -6,7 +6,8 @@ from itertools import combinations
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypotheses import examples
+from hypothesis import given
 from mesh.changes.checks import SEEDS, cells_of, check_change, random_mesh
 
 from difftetvr.errors import MeshError
@@ -74,7 +75,7 @@ def letters(mesh, apex, cell, edges, middle):
     return found
 
 
-@settings(max_examples=25, deadline=None)
+@examples(25)
 @given(seed=SEEDS)
 def test_rising_and_falling_constraints_of_the_article(seed):
     mesh = random_mesh(seed)
@@ -101,7 +102,7 @@ def test_rising_and_falling_constraints_of_the_article(seed):
             sides[corners[0], one, other] = letter
 
 
-@settings(max_examples=40, deadline=None)
+@examples(40)
 @given(seed=SEEDS)
 def test_stars_of_random_vertices_in_a_row(seed):
     mesh = random_mesh(seed, torch.float64 if seed % 2 else torch.float32)

@@ -3,14 +3,15 @@
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypotheses import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 from difftetvr.mesh import TetMesh
 from difftetvr.mesh.making.delaunay_check import is_convex, is_delaunay
 
 seeds = st.integers(0, 2**32 - 1)
-properties = settings(max_examples=10, deadline=None)
+properties = examples(10)
 
 CORNERS = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
 

@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 import torch
-from hypothesis import assume, given, settings
+from hypotheses import examples
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as numbers
 from scipy.spatial import ConvexHull
@@ -24,7 +25,7 @@ def rotation():
     return q
 
 
-@settings(max_examples=20, deadline=None)
+@examples(20)
 @given(
     shape=st.tuples(*[st.integers(1, 5)] * 3),
     lower=st.tuples(*[st.floats(-10, 10)] * 3),
@@ -88,7 +89,7 @@ def assert_conforming_hull(mesh, points):
     assert 2 * len(edges) == 3 * len(boundary)
 
 
-@settings(max_examples=15, deadline=None)
+@examples(15)
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(4, 200), dtype=st.sampled_from([np.float32, np.float64]))
 def test_delaunay_of_random_points(seed, count, dtype):
     points = np.random.default_rng(seed).random((count, 3)).astype(dtype)
@@ -155,7 +156,7 @@ def test_delaunay_errors(points, message):
         TetMesh.delaunay(points)
 
 
-@settings(max_examples=60, deadline=None)
+@examples(60)
 @given(
     shape=st.tuples(*[st.integers(1, 8)] * 3),
     layers=st.integers(1, 4),
@@ -189,7 +190,7 @@ def test_the_cubes_of_a_shell_grow():
     assert on_axis.tolist() == pytest.approx([-8, -4, -2, -1, -0.5, 0, 0.5, 1, 2, 4, 8], abs=1e-5)
 
 
-@settings(max_examples=60, deadline=None)
+@examples(60)
 @given(numbers.arrays(bool, numbers.array_shapes(min_dims=3, max_dims=3, max_side=6)))
 def test_solids_without_pinches_have_manifold_boundaries(keep):
     filled = without_pinches(keep)

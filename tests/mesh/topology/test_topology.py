@@ -6,7 +6,8 @@ from itertools import combinations
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypotheses import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 from difftetvr.mesh import TetMesh, Topology
@@ -27,7 +28,7 @@ def random_mesh(seed, count=40):
 
 
 meshes = st.integers(0, 2**32 - 1).map(random_mesh)
-properties = settings(max_examples=25, deadline=None)
+properties = examples(25)
 
 
 def half_faces_by_vertices(mesh):

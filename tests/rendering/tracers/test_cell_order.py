@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypotheses import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 from difftetvr.mesh import TetMesh
@@ -12,7 +13,7 @@ from difftetvr.rendering.tracers import cell_order
 from difftetvr.rendering.tracers.cell_order import visibility_order
 
 seeds = st.integers(0, 2**32 - 1)
-properties = settings(max_examples=6, deadline=None)
+properties = examples(6)
 
 SHORT = 1e-9
 """Crossings and overlaps of crossings below this count as none, in units of the mesh's extent."""

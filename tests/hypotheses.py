@@ -1,0 +1,12 @@
+"""How many random examples a test looks at: few, or under `make test-all` many more."""
+
+import os
+
+from hypothesis import settings
+
+_TIMES = 5 if os.environ.get("DIFFTETVR_TESTS") == "thorough" else 1
+
+
+def examples(count):
+    """Settings for `count` examples, times five where tests are to be thorough."""
+    return settings(max_examples=_TIMES * count, deadline=None)
