@@ -56,5 +56,6 @@ for step in range(STEPS + 1):
 rows = [(f"truth, view {view}", capture.images[view], image.detach(), 1.0)]
 dtv.view.pictures.save_comparisons(folder / "own_training_loop.png", rows)
 field = dtv.Field(color.detach(), capture.density_unit * density.detach())
-dtv.view.cut.cut_picture(positions.mesh, field, size=384).save(folder / "own_training_loop_cut.png")
+cut = dtv.view.cut.cut_picture(positions.mesh, field, size=384, background=(1.0, 1.0, 1.0))
+cut.save(folder / "own_training_loop_cut.png")
 # sphinx_gallery_thumbnail_number = 2

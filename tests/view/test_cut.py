@@ -110,3 +110,14 @@ def test_views_without_valid_pixels_are_not_compared(capture):
     models = [Model("grey", mesh, field)]
     all_rows, fewer = (compare_models(views, models, rows=99).height for views in (capture, masked))
     assert fewer < all_rows
+
+
+def test_a_background_shows_through_the_slab_and_beside_it_with_dark_lines_on_light():
+    mesh = TetMesh.grid((1, 1, 1))
+    thin = Field(torch.full((8, 3), 0.5), torch.full((8,), 1e-6))
+    white = (1.0, 1.0, 1.0)
+    assert pixels(cut_picture(mesh, thin, size=64, outlines=False, background=white)).min() > 0.99
+    opaque = Field(torch.full((8, 3), 0.5), torch.full((8,), 1e6))
+    assert abs(pixels(cut_picture(mesh, opaque, size=64, outlines=False, background=white)) - 0.5).max() < 0.01
+    drawn = pixels(cut_picture(mesh, thin, size=64, background=white))
+    assert drawn.min() < 0.7, "outlines must show on white"

@@ -15,7 +15,6 @@ from difftetvr.mesh.topology.topology import LOCAL_EDGES
 
 _SMOOTHING = 2  # lines are drawn so many times larger, and shrunk
 _PIXELS_AT_ONCE = 2_000_000
-_LINE = (255, 255, 255)
 _LINE_STRENGTH = 0.45
 _ASIDE = 1e-6 * 0.7548776662  # planes through vertices are moved by this part of the mesh's size: no cell is cut badly
 
@@ -91,7 +90,8 @@ def cut_picture(
 
     pixels = _fill(np.tile(np.array(background), (height, width, 1)), to_pixels(section.triangles), section.colors)
     picture = Image.fromarray((255.0 * pixels.clip(0, 1)).round().astype(np.uint8))
-    return _with_outlines(picture, to_pixels(section.outlines)) if outlines else picture
+    line = (0, 0, 0) if sum(background) > 1.5 else (255, 255, 255)
+    return _with_outlines(picture, to_pixels(section.outlines), line) if outlines else picture
 
 
 def _section(mesh: TetMesh, plane: Plane, colors: np.ndarray) -> _Section:
@@ -182,10 +182,10 @@ def _cross(p: np.ndarray, q: np.ndarray) -> np.ndarray:
     return p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]
 
 
-def _with_outlines(picture: Image.Image, outlines: np.ndarray) -> Image.Image:
+def _with_outlines(picture: Image.Image, outlines: np.ndarray, color: tuple[int, int, int]) -> Image.Image:
     mask = Image.new("L", (_SMOOTHING * picture.width, _SMOOTHING * picture.height), 0)
     draw = ImageDraw.Draw(mask)
     for start, end in (_SMOOTHING * outlines).tolist():
         draw.line((*start, *end), fill=round(255 * _LINE_STRENGTH))
     mask = mask.resize(picture.size, Image.Resampling.BOX)
-    return Image.composite(Image.new("RGB", picture.size, _LINE), picture, mask)
+    return Image.composite(Image.new("RGB", picture.size, color), picture, mask)
