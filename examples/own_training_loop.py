@@ -25,8 +25,7 @@ mesh = dtv.TetMesh.grid((5, 5, 8), *capture.bounds.tolist())
 color = torch.full((mesh.num_vertices, 3), 0.5, requires_grad=True)
 density = torch.full((mesh.num_vertices,), 0.05, requires_grad=True)
 optimizer = torch.optim.Adam([color, density], lr=0.03, betas=(0.9, 0.99), eps=1e-15)
-config = VertexOptimizerConfig(boundary="slide")
-positions = VertexOptimizer(mesh, config)
+positions = VertexOptimizer(mesh, VertexOptimizerConfig(boundary="slide"))
 
 # %%
 # The loop. After each step colours and densities are projected to where they are valid.
@@ -43,7 +42,7 @@ for step in range(STEPS + 1):
         color.clamp_(0.0, 1.0)
         density.clamp_(min=0.0)
     if step % 2 == 1:  # the gradients of two views make one move
-        positions.step(config.rate_at(step / STEPS))
+        positions.step(positions.config.rate_at(step / STEPS))
         positions.zero_grad()
     if step % 40 == 0:
         smallest = positions.mesh.volumes().min().item()
@@ -53,8 +52,8 @@ for step in range(STEPS + 1):
 # %%
 # The last view beside its truth, and where the vertices went.
 
-rows = [(f"truth, view {view}", capture.images[view], image.detach(), 1.0)]
-dtv.view.pictures.save_comparisons(folder / "own_training_loop.png", rows)
+row = (f"truth, view {view}", capture.images[view], image.detach(), 1.0)
+dtv.view.pictures.save_comparisons(folder / "own_training_loop.png", [row])
 field = dtv.Field(color.detach(), capture.density_unit * density.detach())
 cut = dtv.view.cut.cut_picture(positions.mesh, field, size=384, background=(1.0, 1.0, 1.0))
 cut.save(folder / "own_training_loop_cut.png")
