@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 
@@ -38,11 +40,13 @@ def test_tomography(tmp_path):
     assert last_number(output, r"off by ([\d.]+) %") < 5.0
 
 
+@pytest.mark.slow  # a whole reconstruction
 def test_fit_volume(tmp_path):
     output = run(str(ROOT / "examples" / "fit_volume.py"), str(tmp_path), folder=tmp_path)
     assert last_number(output, r"PSNR ([\d.]+)") > 23.0
 
 
+@pytest.mark.slow  # a whole reconstruction
 def test_fit_photos(tmp_path):
     output = run(str(ROOT / "examples" / "fit_photos.py"), str(tmp_path), folder=tmp_path)
     assert last_number(output, r"PSNR ([\d.]+)") > 25.0
