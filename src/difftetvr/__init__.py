@@ -11,6 +11,6 @@ Names load when they are first used, so that importing the package, and asking t
 import of PyTorch; ``EAGER_IMPORT=1`` in the environment loads all at once.
 """
 
-import lazy_loader
+from difftetvr._lazy import attach
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = attach(__name__, __file__)

@@ -211,8 +211,8 @@ def backend_states() -> list[BackendState]:
         try:
             get_backend(device)
             works, text = True, _description(name)
-        except BackendError as error:
-            works, text = False, str(error)
+        except Exception as error:  # whatever a broken driver or library raises belongs into the report
+            works, text = False, " ".join(str(error).split())
         states.append(BackendState(name, device, works, text, works and name != "metal"))
     return states
 
@@ -223,6 +223,8 @@ def _description(name: str) -> str:
         library = os.environ.get(PATH_VARIABLE, "found by Dr.Jit itself")
         return f"LLVM {version} ({library}), {dr.thread_count()} threads; PyTorch has {torch.get_num_threads()}"
     if name == "cuda":
+        if not torch.cuda.is_available():
+            raise BackendError("Dr.Jit can use CUDA here, this PyTorch cannot; install one that is built for CUDA.")
         free, total = (amount / 2**30 for amount in torch.cuda.mem_get_info())
         version = f"CUDA {torch.version.cuda} in PyTorch, driver for {dr.detail.cuda_version()}"
         return f"{torch.cuda.get_device_name()}, {version}, {free:.1f} of {total:.1f} GiB free"

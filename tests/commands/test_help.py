@@ -72,13 +72,14 @@ def _flags(text):
 
 
 @pytest.mark.parametrize("name", cli.COMMANDS)
-@pytest.mark.parametrize("width", [60, 80, 140])
+@pytest.mark.parametrize("width", [40, 60, 80, 140])
 def test_help_wraps_to_the_terminal_and_has_no_noise(name, width, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", str(width))
     assert cli.main([name, "--help"]) == 0
     shown = capsys.readouterr().out
     long = [line for line in shown.splitlines() if len(line.rstrip()) > width]
     assert not [line for line in long if " " in line.strip()], "only single words may be wider"
+    assert "…" not in shown, "text is cut off"
     assert "None" not in shown and "{" not in shown and "MISSING" not in shown
     assert all(option.text for option in options_of(cli.command_type(name))), "an option without a description"
 
@@ -128,6 +129,48 @@ def test_backgrounds_have_one_spelling_everywhere(name):
         assert (command.config if name == "fit" else command).background == value
 
 
+@pytest.mark.parametrize("option", ["--background", "--grid"])
+def test_options_before_positional_arguments_leave_these_alone(option):
+    words = {"--background": ["1", "0", "0.5"], "--grid": ["4", "3", "2"]}[option]
+    for given in (words, ["white"] if option == "--background" else words):
+        command = cli.parse_command(["fit", option, *given, "tooth", "--seed", "3", "-o", "x"])
+        assert command.capture == "tooth" and command.config.seed == 3
+    command = cli.parse_command(["compare", "tooth", "--background", "white", "a.vtu", "b.vtu", "-o", "p.png"])
+    assert [path.name for path in command.models] == ["a.vtu", "b.vtu"] and command.background == "white"
+    command = cli.parse_command(
+        ["render", "--eye", "1", "-2", "3", "--background", "1", "1", "1", "a.vtu", "-o", "p.png"]
+    )
+    assert command.eye == (1.0, -2.0, 3.0) and command.background == (1.0, 1.0, 1.0) and command.model.name == "a.vtu"
+
+
+def test_none_leaves_options_of_every_type_open():
+    words = [
+        "--device",
+        "--initial-mesh",
+        "--transfer-function",
+        "--cells",
+        "--grid",
+        "--start",
+        "--background",
+        "--bounds",
+    ]
+    command = cli.parse_command(["fit", "tooth", "-o", "x", *(word for name in words for word in (name, "None"))])
+    config, views = command.config, command.views_of
+    assert (config.device, config.initial_mesh, config.cells, config.grid, config.start) == (None,) * 5
+    assert (config.background, views.transfer_function, views.bounds) == (None,) * 3
+    assert cli.parse_command(["eval", "a.vtu", "tooth", "-o", "None"]).output is None
+
+
+def test_help_is_there_for_whoever_names_a_wrong_file(tmp_path, capsys):
+    assert cli.main(["fit", "--config", str(tmp_path / "missing.json"), "--help"]) == 0
+    assert "--cells N" in capsys.readouterr().out
+
+
+def test_usage_shows_what_must_be_given(capsys):
+    assert cli.main(["mesh", "--help"]) == 0
+    assert capsys.readouterr().out.startswith("usage: difftetvr mesh [SOURCE] -o FILE [OPTIONS]\n")
+
+
 def test_doctor_tells_versions_back_ends_and_the_error_of_a_test_image(capsys):
     assert cli.main(["doctor"]) == 0
     shown = capsys.readouterr().out
@@ -147,6 +190,24 @@ def test_doctor_finds_a_back_end_that_renders_wrongly(capsys, monkeypatch):
 
     monkeypatch.setattr(doctor, "_sample", wrong)
     assert "renders wrongly" in fails(capsys, "doctor")
+
+
+def test_doctor_goes_on_where_a_back_end_breaks(capsys, monkeypatch):
+    import difftetvr.backend as backend
+    from difftetvr.cli import doctor
+
+    def broken(*args):
+        raise RuntimeError("the driver\nis broken")
+
+    monkeypatch.setattr(doctor, "_sample", broken)
+    assert cli.main(["doctor"]) == 2
+    said = capsys.readouterr()
+    assert (
+        "a test image fails: the driver is broken" in said.out and "metal:" in said.out and "Traceback" not in said.err
+    )
+    monkeypatch.setattr(backend, "_description", broken)
+    assert cli.main(["doctor"]) == 2
+    assert "llvm:     the driver is broken" in capsys.readouterr().out
 
 
 def test_doctor_says_what_to_do_where_nothing_starts(capsys, monkeypatch):

@@ -121,3 +121,12 @@ def test_a_background_shows_through_the_slab_and_beside_it_with_dark_lines_on_li
     assert abs(pixels(cut_picture(mesh, opaque, size=64, outlines=False, background=white)) - 0.5).max() < 0.01
     drawn = pixels(cut_picture(mesh, thin, size=64, background=white))
     assert drawn.min() < 0.7, "outlines must show on white"
+
+
+def test_colours_of_cells_stay_apart_where_a_mesh_has_as_many_vertices_as_cells():
+    mesh = TetMesh.grid((2, 1, 1))
+    assert mesh.num_cells == mesh.num_vertices
+    color = torch.linspace(0.0, 1.0, mesh.num_cells)[:, None].expand(-1, 3)
+    field = Field(color, torch.full((mesh.num_cells,), DENSE), location="cell")
+    shown = cut_picture(mesh, field, Plane((0.0, 0.0, 1.0)), size=64, outlines=False)
+    assert len(shown.getcolors()) <= mesh.num_cells + 1

@@ -4,6 +4,6 @@ A :class:`~difftetvr.Capture` holds both; inner rooms make it from photographs (
 (`volumes`).
 """
 
-import lazy_loader
+from difftetvr._lazy import attach
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = attach(__name__, __file__)

@@ -5,6 +5,7 @@ PyTorch takes seconds to import, so only a command that runs does it: help, vers
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import importlib
 import sys
@@ -13,7 +14,7 @@ from typing import Any
 
 from difftetvr._version import __version__
 from difftetvr.cli.options import parse
-from difftetvr.errors import FitError
+from difftetvr.errors import DiffTetError, FitError
 from difftetvr.terminal import console, sentence_for, waiting
 
 __all__ = ["COMMANDS", "command_type", "main", "parse_command"]
@@ -106,8 +107,10 @@ def _tell(given: Sequence[str]) -> bool:
         print_overview(console(), {name: command_type(name) for name in COMMANDS})
     elif any(word in _HELP for word in given[1:]):
         kind = command_type(given[0])
-        asked = [word for word in given[1:] if word not in _HELP]
-        print_help(console(), given[0], kind, _saved(kind, asked))
+        saved = None
+        with contextlib.suppress(DiffTetError):  # help is there for whoever names the wrong file, too
+            saved = _saved(kind, [word for word in given[1:] if word not in _HELP])
+        print_help(console(), given[0], kind, saved)
     else:
         return False
     return True

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import platform
 from collections.abc import Iterator
@@ -40,13 +41,16 @@ class Doctor:
         wrong = []
         for state in states:
             console.print(f"{state.name + ':':<10}{state.text}", highlight=False)
-            if state in running:
+            if state not in running:
+                continue
+            try:
                 error, against = _error(state, running)
-                console.print(
-                    f"{'':<10}a test image and its gradients are off by {error:.1e} {against}", highlight=False
-                )
-                if not error < _LARGEST_ERROR:
-                    wrong.append(state.name)
+                text = f"a test image and its gradients are off by {error:.1e} {against}"
+            except Exception as failure:  # one that fails must not hide what the others do
+                error, text = math.inf, f"a test image fails: {' '.join(str(failure).split())}"
+            console.print(f"{'':<10}{text}", highlight=False)
+            if not error < _LARGEST_ERROR:
+                wrong.append(state.name)
         if not running:
             raise BackendError(f"No back end starts, so nothing can be rendered. {states[0].text}")
         if wrong:

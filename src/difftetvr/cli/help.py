@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import docstring_parser
+import tyro
 from rich.console import Console, Group, RenderableType
 from rich.padding import Padding
 from rich.table import Table
@@ -20,6 +21,7 @@ from tyro.conf import OmitArgPrefixes, Positional
 
 _REST = "Options"
 _FLAG_WIDTH = 30
+_NARROW, _INDENT = 60, 2
 _PLACEHOLDERS = {bool: "", int: "N", float: "X", str: "NAME", Path: "FILE"}
 
 Groups = dict[str, tuple[str, ...]]
@@ -36,12 +38,16 @@ class Option:
         flags: As it is written: ``-o FILE, --output FILE``, ``--no-move``, ``CAPTURE``.
         text: What it does, and its default.
         is_positional: Whether it is known by its place.
+        is_required: Whether it must be given.
+        declared: Its type.
     """
 
     name: str
     flags: str
     text: str
     is_positional: bool
+    is_required: bool
+    declared: Any
 
 
 def print_help(console: Console, command: str, kind: type, default: Any = None) -> None:
@@ -54,9 +60,10 @@ def print_help(console: Console, command: str, kind: type, default: Any = None) 
         default: Holds the values of options that are not given; None: as declared.
     """
     options = list(options_of(kind, default))
-    positional = " ".join(option.flags for option in options if option.is_positional)
+    named = [option.flags.split(",")[0] for option in options if option.is_required and not option.is_positional]
+    placed = [option.flags if option.is_required else f"[{option.flags}]" for option in options if option.is_positional]
     about = _joined(docstring_parser.parse(kind.__doc__ or "").description or "")
-    _print(console, Text(" ".join(f"usage: difftetvr {command} {positional} [OPTIONS]".split())), "", Text(about))
+    _print(console, Text(" ".join(["usage: difftetvr", command, *placed, *named, "[OPTIONS]"])), "", Text(about))
     short = [len(option.flags) for option in options if len(option.flags) <= _FLAG_WIDTH]
     for title, members in _grouped(options, getattr(kind, "groups", {})):
         _print_section(console, title, [(option.flags, option.text) for option in members], max(short))
@@ -109,16 +116,16 @@ def _options(kind: Any, default: Any, prefix: str, in_pairs: bool) -> Iterator[O
             continue
         shown = next((note.metavar for note in settings if note.metavar), None) or _placeholder(declared, field.name)
         aliases = [alias for note in settings for alias in note.aliases or ()]
-        text = _joined(texts.get(field.name, ""))
+        text, is_required = _joined(texts.get(field.name, "")), _is_missing(value)
         if Positional in notes:
-            yield Option(name, shown, text, True)
+            yield Option(name, shown, text, True, is_required, declared)
         elif declared is bool:
             on, off = f"--{name}", "--" + re.sub(r"([^.]+)$", r"no-\1", name)
             flags = f"{on}, {off}" if in_pairs else off if value else on
-            yield Option(name, flags, f"{text} (default: {'on' if value else 'off'})", False)
+            yield Option(name, flags, f"{text} (default: {'on' if value else 'off'})", False, False, declared)
         else:
             flags = ", ".join(f"{flag} {shown}" for flag in (*aliases, f"--{name}"))
-            yield Option(name, flags, text + _default_text(value, text), False)
+            yield Option(name, flags, text + _default_text(value, text), False, is_required, declared)
 
 
 def _grouped(options: list[Option], titles: Groups) -> Iterator[tuple[str, list[Option]]]:
@@ -144,6 +151,8 @@ def _print(console: Console, *lines: RenderableType) -> None:
 
 def _print_section(console: Console, title: str, lines: list[tuple[str, str]], width: int) -> None:
     """A title, and flags with their texts in two columns; flags that are too long stand above their text."""
+    if console.width < _NARROW:
+        width = _INDENT  # all flags stand above their texts
     rows: list[RenderableType] = []
     _print(console, "", Text(title, style="bold"))
     for flags, text in lines:
@@ -151,9 +160,9 @@ def _print_section(console: Console, title: str, lines: list[tuple[str, str]], w
         row.add_column(width=width)
         row.add_column()
         if len(flags) > width:
-            rows.append(Text(flags, style="cyan"))
+            rows.append(Text(flags, style="cyan", overflow="fold"))
             flags = ""
-        row.add_row(Text(flags, style="cyan"), Text(text))
+        row.add_row(Text(flags, style="cyan"), Text(text, overflow="fold"))
         rows.append(row)
     _print(console, Padding(Group(*rows), (0, 0, 0, 2)))
 
@@ -183,7 +192,7 @@ def _placeholder(declared: Any, name: str) -> str:
         return "|".join(str(part) for part in parts)
     if origin is tuple:
         return f"{_placeholder(parts[0], name)} ..." if parts[-1] is Ellipsis else _letters(name, parts)
-    return "FILE" if name in ("transfer_function", "initial_mesh") else _PLACEHOLDERS[declared]
+    return "FILE" if name in ("transfer_function", "initial_mesh") else _PLACEHOLDERS.get(declared, "VALUE")
 
 
 def _letters(name: str, parts: tuple[Any, ...]) -> str:
@@ -194,7 +203,7 @@ def _letters(name: str, parts: tuple[Any, ...]) -> str:
         return "A B C D"
     if len(parts) == 3:
         return "NX NY NZ" if parts[0] is int else "X Y Z"
-    return "X Y Z X Y Z" if len(parts) == 6 else " ".join(_PLACEHOLDERS[part] for part in parts)
+    return "X Y Z X Y Z" if len(parts) == 6 else " ".join(_PLACEHOLDERS.get(part, "VALUE") for part in parts)
 
 
 def _default_of(field: dataclasses.Field[Any]) -> Any:
@@ -203,7 +212,7 @@ def _default_of(field: dataclasses.Field[Any]) -> Any:
 
 def _is_missing(value: Any) -> bool:
     """Whether a value must be given: dataclasses' mark, or tyro's."""
-    return value is dataclasses.MISSING or "MISSING" in type(value).__name__.upper()
+    return value is dataclasses.MISSING or value is tyro.MISSING
 
 
 def _default_text(value: Any, text: str) -> str:

@@ -22,7 +22,7 @@ from tyro.constructors import (
     UnsupportedTypeAnnotationError,
 )
 
-from difftetvr.cli.help import Groups
+from difftetvr.cli.help import Groups, options_of
 from difftetvr.errors import CaptureError
 from difftetvr.terminal import waiting
 
@@ -196,9 +196,36 @@ def parse(kind: type, name: str, args: Sequence[str], default: Any = None) -> An
     """
     # With pairs (--move, --no-move) where options come from a file: it may say either, and arguments must turn it.
     settings = (FlagCreatePairsOff,) if default is None else ()
+    args = _positionals_first(kind, args)
     registry = ConstructorRegistry()
     registry.primitive_rule(_union)
     return tyro.cli(kind, prog=f"difftetvr {name}", args=args, default=default, config=settings, registry=registry)
+
+
+def _positionals_first(kind: type, args: Sequence[str]) -> list[str]:
+    """Arguments in an order in which options that take one word or several cannot take positional ones for theirs."""
+    several = {f"--{option.name}": count for option in options_of(kind) if (count := _several(option.declared))}
+    left = list(args)
+    moved: list[str] = []
+    for at in reversed([i for i, word in enumerate(left) if word in several]):
+        words = 1 if left[at + 1 : at + 2] and not _is_number(left[at + 1]) else several[left[at]]
+        moved[:0] = left[at : at + 1 + words]
+        del left[at : at + 1 + words]
+    return left + moved
+
+
+def _several(declared: Any) -> int:
+    """Numbers that an option takes which may also be one word; 0 for all others."""
+    parts = typing.get_args(declared) if typing.get_origin(declared) in (typing.Union, types.UnionType) else ()
+    return max((len(typing.get_args(part)) for part in parts if typing.get_origin(part) is tuple), default=0)
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 def _union(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | UnsupportedTypeAnnotationError | None:
@@ -214,6 +241,8 @@ def _union(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | Unsupport
         if not isinstance(spec, PrimitiveConstructorSpec):
             return spec
         specs.append(spec)
+    # None comes first: a text or a path could be made of it as well.
+    specs.sort(key=lambda spec: spec.choices != (_NONE,))
     metavar = "|".join(spec.metavar.strip("{}").replace(",", "|") for spec in specs if spec.choices != (_NONE,))
 
     def value_of(words: list[str]) -> Any:

@@ -4,6 +4,6 @@ The loop, its losses and the steps of vertices stand here; inner rooms hold what
 its mesh refines itself (`refinement`) and what it leaves (`records`).
 """
 
-import lazy_loader
+from difftetvr._lazy import attach
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = attach(__name__, __file__)

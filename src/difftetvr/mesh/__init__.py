@@ -4,6 +4,6 @@ Positions, cells and the field on them stand here; inner rooms hold how cells me
 (`making`), how their cells change (`changes`) and their files (`io`).
 """
 
-import lazy_loader
+from difftetvr._lazy import attach
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = attach(__name__, __file__)

@@ -11,17 +11,4 @@ from .model import OpticalModel as OpticalModel
 from .subsegments import SubSegments as SubSegments
 from .transfer_function import TransferFunction as TransferFunction
 
-__all__ = [
-    "ConstantPerCell",
-    "ExactLinear",
-    "OpticalModel",
-    "SubSegments",
-    "TransferFunction",
-    "coefficients",
-    "constant",
-    "exact",
-    "model",
-    "special",
-    "subsegments",
-    "transfer_function",
-]
+__all__ = ["ConstantPerCell", "ExactLinear", "OpticalModel", "SubSegments", "TransferFunction"]

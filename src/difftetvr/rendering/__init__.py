@@ -4,6 +4,6 @@ Cameras make rays (`cameras`), tracers find the cells that they cross in order (
 (`traversal`), and kernels gather something from them (`kernels`): light, derivatives, what a finer mesh would win.
 """
 
-import lazy_loader
+from difftetvr._lazy import attach
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = attach(__name__, __file__)

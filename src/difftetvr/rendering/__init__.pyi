@@ -14,20 +14,4 @@ from .cameras.pinhole import Camera as Camera
 from .scalar_field import ScalarField as ScalarField
 from .tracers.projected import OrderWarning as OrderWarning
 
-__all__ = [
-    "Camera",
-    "OrderWarning",
-    "RenderedImage",
-    "ScalarField",
-    "api",
-    "autograd",
-    "cameras",
-    "clip_plane",
-    "gauss_newton",
-    "inspection",
-    "kernels",
-    "render",
-    "scalar_field",
-    "tracers",
-    "traversal",
-]
+__all__ = ["Camera", "OrderWarning", "RenderedImage", "ScalarField", "render"]

@@ -7,4 +7,4 @@ from . import plots as plots
 from . import report as report
 from .pictures import save_png as save_png
 
-__all__ = ["compare", "cut", "describe", "heatmap", "pictures", "plots", "report", "save_png"]
+__all__ = ["save_png"]

@@ -9,7 +9,7 @@ import torch
 from PIL import Image, ImageDraw
 
 from difftetvr.errors import MeshError
-from difftetvr.mesh.field import Field
+from difftetvr.mesh.field import Field, Location
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.mesh.topology.topology import LOCAL_EDGES
 
@@ -78,7 +78,7 @@ def cut_picture(
     Raises:
         MeshError: The plane misses the mesh, or its normal is no direction.
     """
-    section = _section(mesh, plane or Plane(), _slab_colors(mesh, field, np.array(background)))
+    section = _section(mesh, plane or Plane(), _slab_colors(mesh, field, np.array(background)), field.location_on(mesh))
     points = section.outlines.reshape(-1, 2)
     lower, extent = points.min(0), np.ptp(points, axis=0)
     scale = (size - 1) / extent.max()
@@ -94,8 +94,8 @@ def cut_picture(
     return _with_outlines(picture, to_pixels(section.outlines), line) if outlines else picture
 
 
-def _section(mesh: TetMesh, plane: Plane, colors: np.ndarray) -> _Section:
-    """Where a plane cuts a mesh with one colour for each of its vertices, or of its cells."""
+def _section(mesh: TetMesh, plane: Plane, colors: np.ndarray, location: Location) -> _Section:
+    """Where a plane cuts a mesh with colours on its vertices or its cells."""
     positions = mesh.vertices.detach().double().cpu().numpy()
     center = 0.5 * (positions.min(0) + positions.max(0))
     size = float(np.linalg.norm(np.ptp(positions, axis=0)))
@@ -107,7 +107,7 @@ def _section(mesh: TetMesh, plane: Plane, colors: np.ndarray) -> _Section:
     cut = np.flatnonzero(above.any(1) & ~above.all(1))
     if not len(cut):
         raise MeshError(f"The plane at {tuple(origin.tolist())} misses the mesh; move it into the mesh's bounds.")
-    per_cell = len(colors) != len(positions)
+    per_cell = location == "cell"
 
     places, shades, owners = [], [], []
     for i, j in LOCAL_EDGES:

@@ -3,6 +3,6 @@
 `readers` finds views in the files of other programs; what is here decodes, undistorts and bounds them.
 """
 
-import lazy_loader
+from difftetvr._lazy import attach
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = attach(__name__, __file__)

@@ -10,16 +10,4 @@ from . import undistort as undistort
 from .photo_capture import PhotoCapture as PhotoCapture
 from .photo_set import CaptureWarning as CaptureWarning
 
-__all__ = [
-    "CaptureWarning",
-    "PhotoCapture",
-    "bounds",
-    "image_file",
-    "lens",
-    "photo_capture",
-    "photo_load",
-    "photo_set",
-    "poses",
-    "readers",
-    "undistort",
-]
+__all__ = ["CaptureWarning", "PhotoCapture"]

@@ -8,14 +8,4 @@ from .volume import Volume as Volume
 from .volume_capture import VolumeCapture as VolumeCapture
 from .volume_renderer import VolumeRenderer as VolumeRenderer
 
-__all__ = [
-    "Volume",
-    "VolumeCapture",
-    "VolumeRenderer",
-    "readers",
-    "volume",
-    "volume_capture",
-    "volume_file",
-    "volume_kernel",
-    "volume_renderer",
-]
+__all__ = ["Volume", "VolumeCapture", "VolumeRenderer"]

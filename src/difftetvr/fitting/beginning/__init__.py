@@ -3,6 +3,6 @@
 Meshes made for what the images show, meshes from files, and checks of images, options and device.
 """
 
-import lazy_loader
+from difftetvr._lazy import attach
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = attach(__name__, __file__)

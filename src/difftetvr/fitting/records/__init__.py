@@ -3,6 +3,6 @@
 Everything is written whole or not at all, and a run resumes from it to the bit.
 """
 
-import lazy_loader
+from difftetvr._lazy import attach
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = attach(__name__, __file__)

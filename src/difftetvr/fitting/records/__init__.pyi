@@ -5,4 +5,4 @@ from . import history as history
 from . import progress as progress
 from . import result as result
 
-__all__ = ["checkpoint", "evaluation", "folder", "history", "progress", "result"]
+__all__: list[str] = []

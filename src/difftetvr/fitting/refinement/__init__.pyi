@@ -11,17 +11,4 @@ from .strategy import Refinement as Refinement
 from .strategy import Situation as Situation
 from .strategy import Strategy as Strategy
 
-__all__ = [
-    "Exchange",
-    "Grow",
-    "Moment",
-    "Refinement",
-    "Situation",
-    "Star",
-    "Strategy",
-    "exchange",
-    "exchange_round",
-    "gains",
-    "star",
-    "strategy",
-]
+__all__ = ["Exchange", "Grow", "Moment", "Refinement", "Situation", "Star", "Strategy"]

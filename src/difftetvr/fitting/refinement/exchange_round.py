@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
 
-from difftetvr.fitting.refinement.exchange import Exchange
 from difftetvr.fitting.refinement.gains import (
     CollapseCosts,
     bisection_gains,
@@ -23,6 +24,9 @@ from difftetvr.mesh.changes.flips import THREE_TO_TWO, TWO_TO_THREE, apply_flips
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.mesh.topology.incidence import cell_edges, cells_per_edge, find_edges
 from difftetvr.rendering.gauss_newton import ImageModel
+
+if TYPE_CHECKING:
+    from difftetvr.fitting.refinement.exchange import Exchange
 
 _LOOKED_AT = 5.0
 """Vertices whose collapse is priced, in units of those that may vanish."""

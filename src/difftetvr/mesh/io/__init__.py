@@ -7,6 +7,6 @@ Whatever a file holds, reading it gives a valid mesh or a :class:`~difftetvr.Mes
 announces is compared with its size before anything is allocated.
 """
 
-import lazy_loader
+from difftetvr._lazy import attach
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = attach(__name__, __file__)

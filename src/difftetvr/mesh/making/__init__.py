@@ -3,6 +3,6 @@
 Each gives arrays that :class:`~difftetvr.TetMesh` accepts, or a sentence that says why it cannot.
 """
 
-import lazy_loader
+from difftetvr._lazy import attach
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = attach(__name__, __file__)

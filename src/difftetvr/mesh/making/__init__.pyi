@@ -6,12 +6,4 @@ from . import lifting as lifting
 from . import repair as repair
 from . import surfaces as surfaces
 
-__all__ = [
-    "conversion",
-    "delaunay",
-    "delaunay_check",
-    "generators",
-    "lifting",
-    "repair",
-    "surfaces",
-]
+__all__: list[str] = []

@@ -4,4 +4,4 @@ from . import link as link
 from . import rings as rings
 from . import topology as topology
 
-__all__ = ["faces", "incidence", "link", "rings", "topology"]
+__all__: list[str] = []

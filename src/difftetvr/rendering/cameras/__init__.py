@@ -3,6 +3,6 @@
 A camera holds extrinsics, intrinsics and the image's size, and is differentiable in its pose.
 """
 
-import lazy_loader
+from difftetvr._lazy import attach
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = attach(__name__, __file__)

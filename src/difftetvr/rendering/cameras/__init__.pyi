@@ -2,4 +2,4 @@ from . import pinhole as pinhole
 from . import pinhole_rays as pinhole_rays
 from .pinhole import Camera as Camera
 
-__all__ = ["Camera", "pinhole", "pinhole_rays"]
+__all__ = ["Camera"]

@@ -2,4 +2,4 @@ from . import adjoint as adjoint
 from . import forward as forward
 from . import hats as hats
 
-__all__ = ["adjoint", "forward", "hats"]
+__all__: list[str] = []

@@ -3,6 +3,6 @@
 Three answers, the article's two and the walk: `marching`, `linked_list`, `projected`, and what they are built from.
 """
 
-import lazy_loader
+from difftetvr._lazy import attach
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = attach(__name__, __file__)

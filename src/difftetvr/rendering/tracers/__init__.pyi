@@ -10,16 +10,4 @@ from . import projected as projected
 from . import rasterise as rasterise
 from . import tiles as tiles
 
-__all__ = [
-    "bands",
-    "camera_inside",
-    "cell_order",
-    "entry",
-    "entry_table",
-    "fragments",
-    "linked_list",
-    "marching",
-    "projected",
-    "rasterise",
-    "tiles",
-]
+__all__: list[str] = []

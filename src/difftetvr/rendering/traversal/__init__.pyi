@@ -3,4 +3,4 @@ from . import rays as rays
 from . import transfer as transfer
 from . import walk as walk
 
-__all__ = ["crossing", "rays", "transfer", "walk"]
+__all__: list[str] = []

@@ -6,12 +6,4 @@ from . import colmap_text as colmap_text
 from . import tiny_nerf as tiny_nerf
 from . import transforms as transforms
 
-__all__ = [
-    "camera_list",
-    "colmap",
-    "colmap_binary",
-    "colmap_model",
-    "colmap_text",
-    "tiny_nerf",
-    "transforms",
-]
+__all__: list[str] = []

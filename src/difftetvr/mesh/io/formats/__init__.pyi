@@ -9,4 +9,4 @@ from . import through_meshio as through_meshio
 from . import vtk as vtk
 from . import xdmf as xdmf
 
-__all__ = ["bintet", "gmsh", "medit", "npz", "ovm", "table", "tetgen", "through_meshio", "vtk", "xdmf"]
+__all__: list[str] = []
