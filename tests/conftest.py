@@ -1,4 +1,4 @@
-"""What all tests share: the `gpu` marker, one thread for torch, and the folder of example data."""
+"""What all tests share: the `gpu` marker, threads, and the folder of example data."""
 
 import os
 from collections.abc import Iterator
@@ -32,6 +32,27 @@ def one_torch_thread() -> Iterator[None]:
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(threads)
+
+
+@pytest.fixture(autouse=True, scope="session")
+def share_of_the_cores() -> None:
+    """Let kernels of each of several test processes use its share of the cores: more threads wait for each other."""
+    processes = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+    if processes > 1:
+        from difftetvr.backend import dr
+
+        dr.set_thread_count(max(1, (os.cpu_count() or 1) // processes))
+
+
+@pytest.fixture
+def kernel_threads() -> Iterator[None]:
+    """For tests of what threads could upset: run kernels on at least two."""
+    from difftetvr.backend import dr
+
+    threads = dr.thread_count()
+    dr.set_thread_count(max(2, threads))
+    yield
+    dr.set_thread_count(threads)
 
 
 @pytest.fixture(scope="session")

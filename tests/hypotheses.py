@@ -4,9 +4,9 @@ import os
 
 from hypothesis import settings
 
-_TIMES = 5 if os.environ.get("DIFFTETVR_TESTS") == "thorough" else 1
+_TIMES = 10 if os.environ.get("DIFFTETVR_TESTS") == "thorough" else 1
 
 
 def examples(count):
-    """Settings for `count` examples, times five where tests are to be thorough."""
+    """Settings for `count` examples, times ten where tests are to be thorough."""
     return settings(max_examples=_TIMES * count, deadline=None)

@@ -65,6 +65,9 @@ def test_mistakes_of_the_program_are_not_hidden(run, monkeypatch):
         cli.main(["info", str(run / "model.vtu")])
 
 
+SHORTEST = ["--cells", "500", "--iterations", "1", "--refine", "none", "--device", "cpu"]
+
+
 @pytest.mark.parametrize("error", [MemoryError(), OSError(errno.ENOSPC, "No space left on device")])
 @pytest.mark.parametrize("where", ["prepare", "step", "save"])
 @pytest.mark.parametrize("existing", [False, True])
@@ -82,9 +85,9 @@ def test_a_failed_start_leaves_nothing(tmp_path, capsys, monkeypatch, error, whe
     before = sorted(tmp_path.rglob("*"))
     with monkeypatch.context() as patch:
         patch.setattr(*target, raising(error))
-        fails(capsys, "fit", "tooth", "-o", folder, *VIEWS, *FIT)
+        fails(capsys, "fit", "tooth", "-o", folder, *VIEWS, *SHORTEST)
     assert sorted(tmp_path.rglob("*")) == before
-    assert cli.main(["fit", "tooth", "-o", str(folder), *VIEWS, *FIT]) == 0
+    assert cli.main(["fit", "tooth", "-o", str(folder), *VIEWS, *SHORTEST]) == 0
 
 
 def test_a_failure_later_keeps_what_can_be_resumed(tmp_path, capsys, monkeypatch):

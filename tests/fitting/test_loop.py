@@ -65,6 +65,7 @@ def test_values_stay_valid_and_empty_space_becomes_exactly_empty(reference):
     assert not color.requires_grad
 
 
+@pytest.mark.usefixtures("kernel_threads")
 def test_interrupted_run_goes_on_to_the_same_result(small_capture, reference, tmp_path):
     handler = signal.getsignal(signal.SIGINT)  # ignored where the tests run in the background
     path = tmp_path / "checkpoint.safetensors"

@@ -119,6 +119,7 @@ def test_free_space_empties_an_initial_field(room: dtv.Capture) -> None:
 
 
 @pytest.mark.parametrize("name", ["shiny", "room"])
+@pytest.mark.usefixtures("kernel_threads")
 def test_resuming_gives_the_same_bits(name: str, tmp_path, request) -> None:  # type: ignore[no-untyped-def]
     capture = request.getfixturevalue(name)
     options = FAST | {"cells": 3000, "iterations": 16, "exchange": Exchange(rounds=3, views=3)}

@@ -13,7 +13,7 @@ from difftetvr.fitting.regularizers import shape_barrier
 from difftetvr.mesh.changes.bisection import bisect_edges
 from difftetvr.mesh.limits import MotionLimits
 
-properties = examples(25)
+properties = examples(13)
 seeds = st.integers(0, 2**32 - 1)
 boundaries = st.sampled_from(["fixed", "slide"])
 

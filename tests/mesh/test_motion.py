@@ -14,7 +14,7 @@ from difftetvr.mesh.quality import quality, volumes
 from difftetvr.mesh.shapes import measure_vertices
 
 DTYPES = (torch.float32, torch.float64)
-properties = examples(60)
+properties = examples(30)
 seeds = st.integers(0, 2**32 - 1)
 
 
@@ -82,7 +82,7 @@ def test_no_cell_falls_under_its_floors(seed, dtype, kind, cells):
     assert result.halved == ((result.fraction > 0) & (result.fraction < 1)).sum()
 
 
-@examples(10)
+@examples(5)
 @given(seed=seeds, dtype=st.sampled_from(DTYPES))
 def test_many_bad_steps_in_a_row(seed, dtype):
     """Floors are relative to the last step, so volumes may shrink, but shapes never fall under theirs."""

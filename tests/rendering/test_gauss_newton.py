@@ -205,6 +205,7 @@ def test_no_unit_of_length_and_sums_of_views():
     assert both.error == pytest.approx(one.error)
 
 
+@pytest.mark.usefixtures("kernel_threads")
 def test_float32_and_one_thread_agree():
     mesh, field, truth = random_scene()
     exact = model_image(mesh, field, camera_at(OUTSIDE), truth, BACKGROUND)

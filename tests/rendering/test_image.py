@@ -199,6 +199,7 @@ def test_colors_outside_the_unit_interval_are_radiance_like_any_other() -> None:
 
 
 @pytest.mark.parametrize("name", ["porous", "in-hole", "slabs", "delaunay-cells"])
+@pytest.mark.usefixtures("kernel_threads")
 def test_forward_is_deterministic(name: str) -> None:
     scene = SCENES[name]()
     first, second = render_scene(scene), render_scene(scene)

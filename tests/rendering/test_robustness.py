@@ -20,6 +20,7 @@ def scene(unit: float = 1.0, dtype: torch.dtype = torch.float32) -> tuple[TetMes
     return mesh, Field(color, density), Camera.look_at(eye, target, fov_y=0.8, width=30, height=20)
 
 
+@pytest.mark.usefixtures("kernel_threads")
 def test_threads_take_turns() -> None:
     mesh, field, camera = scene()
     expected = render(mesh, field, camera).color

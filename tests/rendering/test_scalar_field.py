@@ -13,6 +13,7 @@ from difftetvr.optics.transfer_function import TransferFunction
 from difftetvr.rendering import Camera, RenderedImage, ScalarField, render
 
 RENDERERS = ("marching", "linked-list", "projected")
+CLIP = (0.3, -0.5, 0.8, 0.05)
 
 
 def transfer_function(seed: int = 3, requires_grad: bool = False) -> TransferFunction:
@@ -136,9 +137,16 @@ def test_knots_that_change_before_the_backward_pass() -> None:
     assert torch.equal(torch.autograd.grad(loss, function.scalar)[0], before)
 
 
-@pytest.mark.parametrize("clip", [None, (0.3, -0.5, 0.8, 0.05)])
 @pytest.mark.parametrize("renderer", RENDERERS)
-@pytest.mark.parametrize("name", ["delaunay", "inside"])
+@pytest.mark.parametrize(
+    ("name", "clip"),
+    [
+        ("delaunay", None),
+        ("inside", CLIP),
+        pytest.param("delaunay", CLIP, marks=pytest.mark.slow),  # kernels of their own, which take long to compile
+        pytest.param("inside", None, marks=pytest.mark.slow),
+    ],
+)
 def test_gradients(name: str, renderer: str, clip: tuple[float, ...] | None) -> None:
     """By vertices, pose, scalars, and the knots' places, opacities and colours, against finite differences."""
     scene = SCENES[name]()

@@ -126,6 +126,7 @@ def test_options_that_contradict_each_other():
         FitConfig(repair=True)
 
 
+@pytest.mark.usefixtures("kernel_threads")
 def test_resuming_goes_on_to_the_same_bits_without_the_file(small_capture, flawed, tmp_path):
     config = options(flawed, repair=True, refine="exchange", iterations=8)
     whole = fit(small_capture, config)

@@ -36,6 +36,7 @@ def state_of(trainer):
 
 @pytest.mark.parametrize("iterations", [10, pytest.param(14, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("refine", ["exchange", "grow", "star"])
+@pytest.mark.usefixtures("kernel_threads")
 def test_killed_at_any_moment_it_goes_on_to_the_same_result(small_capture, tmp_path, refine, iterations):
     config = dataclasses.replace(config_for(refine), iterations=iterations)
     path = tmp_path / "c.safetensors"

@@ -38,7 +38,7 @@ def greedy(mesh, order, budget=None):
     return chosen
 
 
-@examples(40)
+@examples(20)
 @given(seed=SEEDS)
 def test_bisection_of_random_edges_in_a_row(seed):
     mesh = random_mesh(seed, torch.float64 if seed % 2 else torch.float32)
@@ -72,7 +72,7 @@ def test_what_bisection_does_to_one_edge():
     assert (values.grad[ends] == 0.5).all() and values.grad.sum() == 6.0
 
 
-@examples(25)
+@examples(13)
 @given(seed=SEEDS)
 def test_independent_edges_are_those_of_the_greedy_loop(seed):
     mesh = random_mesh(seed)

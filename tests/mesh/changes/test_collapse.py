@@ -48,7 +48,7 @@ def sphere(seed):
     return Topology(torch.from_numpy(cells).int(), len(points))
 
 
-@examples(40)
+@examples(20)
 @given(seed=SEEDS)
 def test_link_condition_of_spheres_and_meshes(seed):
     topology = sphere(seed) if seed % 3 else random_mesh(seed).topology
@@ -138,7 +138,7 @@ def interior_mesh(seed):
     return mesh
 
 
-@examples(8)
+@examples(4)
 @given(seed=SEEDS)
 def test_collapses_are_those_of_the_greedy_loop(seed):
     mesh = interior_mesh(seed)
@@ -161,7 +161,7 @@ def test_collapses_are_those_of_the_greedy_loop(seed):
         assert limit is None or mesh.num_cells - len(remaining) <= limit
 
 
-@examples(5)
+@examples(3)
 @given(seed=SEEDS)
 def test_it_makes_no_difference_how_many_candidates_are_looked_at_together(seed):
     mesh = interior_mesh(seed)
@@ -188,7 +188,7 @@ def test_best_first_part_by_part(dtype):
         assert torch.equal(priority[together], priority.sort(descending=True).values)
 
 
-@examples(10)
+@examples(5)
 @given(seed=SEEDS)
 def test_collapsing_in_a_row(seed):
     mesh = interior_mesh(seed).to(dtype=torch.float64 if seed % 2 else torch.float32)

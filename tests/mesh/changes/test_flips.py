@@ -100,7 +100,7 @@ def interpolate(mesh, values, points):
     return torch.einsum("pk,pkc->pc", weights[rows, cells], values[mesh.tets[cells].long()])
 
 
-@examples(10)
+@examples(5)
 @given(seed=SEEDS)
 def test_every_possible_flip_is_found_and_no_other(seed):
     mesh = random_mesh(seed, torch.float64 if seed % 2 else torch.float32)
@@ -128,7 +128,7 @@ def test_no_flip_makes_a_flat_cell_whatever_the_floor():
         assert found == possible_flips(lattice, -1.0).keys() and found
 
 
-@examples(12)
+@examples(6)
 @given(seed=SEEDS)
 def test_flips_of_random_priority_in_a_row(seed):
     mesh = random_mesh(seed, torch.float64 if seed % 2 else torch.float32)
@@ -163,7 +163,7 @@ def test_flips_of_random_priority_in_a_row(seed):
         mesh = new
 
 
-@examples(15)
+@examples(8)
 @given(seed=SEEDS)
 def test_flips_are_those_of_the_greedy_loop(seed):
     mesh = random_mesh(seed)
@@ -181,7 +181,7 @@ def test_flips_are_those_of_the_greedy_loop(seed):
     assert set(independent_flips(flips, priority).cells.unique().tolist()) - {-1} == used
 
 
-@examples(6)
+@examples(3)
 @given(seed=SEEDS)
 def test_every_flip_can_be_taken_back(seed):
     mesh = random_mesh(seed)
@@ -202,7 +202,7 @@ def test_every_flip_can_be_taken_back(seed):
             assert torch.allclose(one.surplus(values), -undone.surplus(values), atol=1e-9)
 
 
-@examples(12)
+@examples(6)
 @given(seed=SEEDS)
 def test_the_surplus_is_the_change_of_the_interpolated_value(seed):
     mesh = random_mesh(seed, torch.float64 if seed % 2 else torch.float32)
@@ -279,7 +279,7 @@ def test_what_is_there_already_is_not_made_again():
         check_change(flips.mesh, change, keeps_cells=False)
 
 
-@examples(10)
+@examples(5)
 @given(seed=SEEDS)
 def test_closed_rings_are_the_cells_in_order(seed):
     mesh = random_mesh(seed)

@@ -17,7 +17,7 @@ from difftetvr.mesh.changes.star import star_subdivision
 from difftetvr.mesh.locate import locate, search
 
 
-@examples(30)
+@examples(15)
 @given(seed=SEEDS)
 def test_removal_keeps_the_rest_as_it_is(seed):
     mesh = random_mesh(seed)
@@ -62,7 +62,7 @@ def random_change(mesh, generator):
     return remove_cells(mesh, removed)
 
 
-@examples(25)
+@examples(13)
 @given(seed=SEEDS)
 def test_any_changes_in_a_row(seed):
     mesh = random_mesh(seed, torch.float64 if seed % 2 else torch.float32)
@@ -81,7 +81,7 @@ def test_any_changes_in_a_row(seed):
     assert (values - exact).abs().max() <= 1e-5 * origin.abs().max() * 10
 
 
-@examples(15)
+@examples(8)
 @given(seed=SEEDS)
 def test_insertion_is_the_delaunay_mesh_with_values_of_the_old_one(seed):
     mesh = random_mesh(seed)
@@ -120,7 +120,7 @@ def test_insertion_at_vertices_faces_and_outside():
         insert_delaunay(hollow, [[0.1, 0.2, 0.3]])
 
 
-@examples(15)
+@examples(8)
 @given(seed=SEEDS)
 def test_points_are_found_in_their_cells_also_where_the_mesh_is_not_convex(seed):
     mesh = random_mesh(seed)

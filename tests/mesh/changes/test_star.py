@@ -75,7 +75,7 @@ def letters(mesh, apex, cell, edges, middle):
     return found
 
 
-@examples(25)
+@examples(13)
 @given(seed=SEEDS)
 def test_rising_and_falling_constraints_of_the_article(seed):
     mesh = random_mesh(seed)
@@ -102,7 +102,7 @@ def test_rising_and_falling_constraints_of_the_article(seed):
             sides[corners[0], one, other] = letter
 
 
-@examples(40)
+@examples(20)
 @given(seed=SEEDS)
 def test_stars_of_random_vertices_in_a_row(seed):
     mesh = random_mesh(seed, torch.float64 if seed % 2 else torch.float32)

@@ -11,7 +11,7 @@ from difftetvr.mesh import TetMesh
 from difftetvr.mesh.making.delaunay_check import is_convex, is_delaunay
 
 seeds = st.integers(0, 2**32 - 1)
-properties = examples(10)
+properties = examples(5)
 
 CORNERS = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
 

@@ -25,7 +25,7 @@ def rotation():
     return q
 
 
-@examples(20)
+@examples(10)
 @given(
     shape=st.tuples(*[st.integers(1, 5)] * 3),
     lower=st.tuples(*[st.floats(-10, 10)] * 3),
@@ -89,7 +89,7 @@ def assert_conforming_hull(mesh, points):
     assert 2 * len(edges) == 3 * len(boundary)
 
 
-@examples(15)
+@examples(8)
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(4, 200), dtype=st.sampled_from([np.float32, np.float64]))
 def test_delaunay_of_random_points(seed, count, dtype):
     points = np.random.default_rng(seed).random((count, 3)).astype(dtype)
@@ -156,7 +156,7 @@ def test_delaunay_errors(points, message):
         TetMesh.delaunay(points)
 
 
-@examples(60)
+@examples(30)
 @given(
     shape=st.tuples(*[st.integers(1, 8)] * 3),
     layers=st.integers(1, 4),
@@ -190,7 +190,7 @@ def test_the_cubes_of_a_shell_grow():
     assert on_axis.tolist() == pytest.approx([-8, -4, -2, -1, -0.5, 0, 0.5, 1, 2, 4, 8], abs=1e-5)
 
 
-@examples(60)
+@examples(30)
 @given(numbers.arrays(bool, numbers.array_shapes(min_dims=3, max_dims=3, max_side=6)))
 def test_solids_without_pinches_have_manifold_boundaries(keep):
     filled = without_pinches(keep)

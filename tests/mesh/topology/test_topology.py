@@ -28,7 +28,7 @@ def random_mesh(seed, count=40):
 
 
 meshes = st.integers(0, 2**32 - 1).map(random_mesh)
-properties = examples(25)
+properties = examples(13)
 
 
 def half_faces_by_vertices(mesh):

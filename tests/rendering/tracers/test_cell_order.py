@@ -13,7 +13,7 @@ from difftetvr.rendering.tracers import cell_order
 from difftetvr.rendering.tracers.cell_order import visibility_order
 
 seeds = st.integers(0, 2**32 - 1)
-properties = examples(6)
+properties = examples(3)
 
 SHORT = 1e-9
 """Crossings and overlaps of crossings below this count as none, in units of the mesh's extent."""

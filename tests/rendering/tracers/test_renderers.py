@@ -35,6 +35,12 @@ def _exact_orders_only() -> Iterator[None]:
         yield
 
 
+@pytest.fixture
+def one_list_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lets all scenes share kernels, which otherwise depend on their longest lists and take long to compile."""
+    monkeypatch.setattr(linked_list, "LOCAL_SIZES", (64,))
+
+
 def assert_agrees(scene: Scene, dtype: torch.dtype, image_tolerance: float, tolerance: float, **options: str) -> None:
     """The image within a tolerance of the reference, and gradients within another, relative one."""
     weights, expected = oracle_gradients(scene)
@@ -50,20 +56,31 @@ def assert_agrees(scene: Scene, dtype: torch.dtype, image_tolerance: float, tole
 
 @pytest.mark.parametrize("renderer", RENDERERS[1:])
 @pytest.mark.parametrize("name", CONVEX)
+@pytest.mark.usefixtures("one_list_size")
 def test_convex_meshes(name: str, renderer: str) -> None:
     scene = SCENES[name]()
     assert_agrees(scene, torch.float32, 2e-5, 1e-3, renderer=renderer)
     assert_agrees(scene, torch.float64, 1e-10, 1e-8, renderer=renderer)
 
 
-@pytest.mark.parametrize("name", [*NOT_CONVEX, "slabs", "speck", "wide-fov", "beside"])
-def test_linked_lists_of_any_mesh(name: str) -> None:
+def assert_lists_agree(name: str) -> None:
     scene = SCENES[name]()
     assert_agrees(scene, torch.float32, 2e-5, 1e-3, renderer="linked-list")
     assert_agrees(scene, torch.float64, 1e-10, 1e-8, renderer="linked-list")
 
 
-@pytest.mark.parametrize("name", ["delaunay", "porous", "inside-cells"])
+@pytest.mark.parametrize("name", NOT_CONVEX)
+@pytest.mark.usefixtures("one_list_size")
+def test_linked_lists_of_any_mesh(name: str) -> None:
+    assert_lists_agree(name)
+
+
+@pytest.mark.parametrize("name", ["single", "slabs", "speck", "wide-fov", "beside"])
+def test_lists_of_any_length(name: str) -> None:
+    assert_lists_agree(name)
+
+
+@pytest.mark.parametrize("name", [pytest.param("delaunay", marks=pytest.mark.slow), "porous", "inside-cells"])
 def test_lists_longer_than_local_memory_in_many_bands(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Rays take their nearest fragments in batches, and the image is made in parts: nothing is dropped."""
     monkeypatch.setattr(linked_list, "LOCAL_SIZES", (4,))
@@ -113,6 +130,7 @@ def test_stopping_early(renderer: str) -> None:
 
 
 @pytest.mark.parametrize("renderer", RENDERERS[1:])
+@pytest.mark.usefixtures("kernel_threads")
 def test_deterministic_gradients_repeat_to_the_bit(renderer: str) -> None:
     def gradient() -> torch.Tensor:
         leaves = leaves_of(scene, torch.float32, LEAVES)
