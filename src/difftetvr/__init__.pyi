@@ -1,6 +1,8 @@
 from . import backend as backend
 from . import capture as capture
+from . import cli as cli
 from . import errors as errors
+from . import files as files
 from . import fitting as fitting
 from . import mesh as mesh
 from . import optics as optics
