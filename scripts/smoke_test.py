@@ -31,7 +31,7 @@ def check_package() -> None:
 
     place = Path(difftetvr.__file__).resolve()
     assert not place.is_relative_to(CHECKOUT / "src"), f"{place} is the checkout, not an installed package"
-    for name in difftetvr.__all__:
+    for name in dir(difftetvr):
         getattr(difftetvr, name)
     assert (place.parent / "py.typed").is_file()
     print(f"difftetvr {difftetvr.__version__} in {place.parent}")

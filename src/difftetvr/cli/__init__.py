@@ -99,13 +99,15 @@ def main(args: Sequence[str] | None = None) -> int:
 
 def _tell(given: Sequence[str]) -> bool:
     """Prints what arguments ask to be told without running anything; whether they did, as no arguments do."""
-    from difftetvr.cli.help import print_help, print_overview
-
     if given[:1] == ["--version"]:
         print(f"difftetvr {__version__}")
     elif not given or given[0] in _HELP:
+        from difftetvr.cli.help import print_overview  # late: commands that run need no help
+
         print_overview(console(), {name: command_type(name) for name in COMMANDS})
     elif any(word in _HELP for word in given[1:]):
+        from difftetvr.cli.help import print_help
+
         kind = command_type(given[0])
         saved = None
         with contextlib.suppress(DiffTetError):  # help is there for whoever names the wrong file, too

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from difftetvr.cli.help import Groups
+from difftetvr.cli.arguments import Groups
 from difftetvr.cli.options import CAPTURE_GROUPS, CaptureOptions, Color, MeshOptions, color_of, load_model
 from difftetvr.errors import FitError, MeshError, counted
 from difftetvr.files import require_writable

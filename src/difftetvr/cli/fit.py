@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, get_args
 import tyro
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from difftetvr.cli.help import Groups
+from difftetvr.cli.arguments import Groups
 from difftetvr.cli.options import CAPTURE_GROUPS, CaptureOptions
 from difftetvr.cli.saved import SavedRun, saved_run
 from difftetvr.errors import FitError, counted

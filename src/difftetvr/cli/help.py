@@ -8,25 +8,23 @@ import types
 import typing
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
 import docstring_parser
-import tyro
 from rich.console import Console, Group, RenderableType
 from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
-from tyro.conf import OmitArgPrefixes, Positional
+from tyro.conf import Positional
+
+from difftetvr.cli.arguments import Groups, arguments_of, settings_of
 
 _REST = "Options"
 _FLAG_WIDTH = 30
 _NARROW, _INDENT = 60, 2
 _PLACEHOLDERS = {bool: "", int: "N", float: "X", str: "NAME", Path: "FILE"}
-
-Groups = dict[str, tuple[str, ...]]
-"""Titles and the options under them, by their names on the command line without dashes; ``motion.*``: all that begin
-so."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +37,6 @@ class Option:
         text: What it does, and its default.
         is_positional: Whether it is known by its place.
         is_required: Whether it must be given.
-        declared: Its type.
     """
 
     name: str
@@ -47,7 +44,6 @@ class Option:
     text: str
     is_positional: bool
     is_required: bool
-    declared: Any
 
 
 def print_help(console: Console, command: str, kind: type, default: Any = None) -> None:
@@ -91,41 +87,31 @@ def print_overview(console: Console, commands: dict[str, type]) -> None:
 
 
 def options_of(kind: Any, default: Any = None) -> Iterator[Option]:
-    """The arguments that a command's dataclass declares, nested ones included, in their order.
+    """What is shown of the arguments of a command, in their order.
 
     Args:
-        kind: The dataclass, annotated for tyro.
-        default: Holds the values of options that are not given; None: as declared.
+        kind: Its dataclass, annotated for tyro.
+        default: Holds the values of options that are not given, and both --move and --no-move are shown; None: as
+            declared.
     """
-    return _options(kind, default, "", default is not None)
-
-
-def _options(kind: Any, default: Any, prefix: str, in_pairs: bool) -> Iterator[Option]:
-    """Those of a dataclass whose names get a prefix; in pairs, --move and --no-move are given both."""
-    hints = typing.get_type_hints(kind, include_extras=True)
-    texts = _texts(kind)
-    for field in dataclasses.fields(kind):
-        declared, notes = _without_notes(hints[field.name])
-        settings = [note for note in notes if hasattr(note, "metavar")]
-        given = next((note.name for note in settings if note.name is not None), None)
-        name = prefix + (field.name if given is None else given).replace("_", "-")
-        value = _default_of(field) if default is None else getattr(default, field.name)
-        if dataclasses.is_dataclass(declared):
-            inner = prefix if given == "" or OmitArgPrefixes in notes else f"{name}."
-            yield from _options(declared, None if _is_missing(value) else value, inner, in_pairs)
-            continue
-        shown = next((note.metavar for note in settings if note.metavar), None) or _placeholder(declared, field.name)
-        aliases = [alias for note in settings for alias in note.aliases or ()]
-        text, is_required = _joined(texts.get(field.name, "")), _is_missing(value)
-        if Positional in notes:
-            yield Option(name, shown, text, True, is_required, declared)
-        elif declared is bool:
+    for argument in arguments_of(kind, default):
+        name, value, settings = argument.name, argument.value, settings_of(argument.notes)
+        shown = next((note.metavar for note in settings if note.metavar), None)
+        shown = shown or _placeholder(argument.declared, argument.field)
+        text = _joined(_texts(argument.owner).get(argument.field, ""))
+        if Positional in argument.notes:
+            yield Option(name, shown, text, True, argument.is_required)
+        elif argument.declared is bool:
             on, off = f"--{name}", "--" + re.sub(r"([^.]+)$", r"no-\1", name)
-            flags = f"{on}, {off}" if in_pairs else off if value else on
-            yield Option(name, flags, f"{text} (default: {'on' if value else 'off'})", False, False, declared)
+            flags = off if value else on
+            if default is not None:
+                flags = f"{on}, {off}"
+            yield Option(name, flags, f"{text} (default: {'on' if value else 'off'})", False, False)
         else:
+            aliases = [alias for note in settings for alias in note.aliases or ()]
             flags = ", ".join(f"{flag} {shown}" for flag in (*aliases, f"--{name}"))
-            yield Option(name, flags, text + _default_text(value, text), False, is_required, declared)
+            text += " (required)" if argument.is_required else _default_text(value, text)
+            yield Option(name, flags, text, False, argument.is_required)
 
 
 def _grouped(options: list[Option], titles: Groups) -> Iterator[tuple[str, list[Option]]]:
@@ -167,6 +153,7 @@ def _print_section(console: Console, title: str, lines: list[tuple[str, str]], w
     _print(console, Padding(Group(*rows), (0, 0, 0, 2)))
 
 
+@cache
 def _texts(kind: type) -> dict[str, str]:
     """What is written below each field, or about it in the docstring, of the class and of those it derives from."""
     texts: dict[str, str] = {}
@@ -175,12 +162,6 @@ def _texts(kind: type) -> dict[str, str]:
             found = docstring_parser.parse_from_object(base).params
             texts |= {param.arg_name: param.description for param in found if param.description}
     return texts
-
-
-def _without_notes(hint: Any) -> tuple[Any, tuple[Any, ...]]:
-    """A type without its annotations, and these."""
-    notes = getattr(hint, "__metadata__", ())
-    return (hint.__origin__, notes) if notes else (hint, ())
 
 
 def _placeholder(declared: Any, name: str) -> str:
@@ -206,18 +187,7 @@ def _letters(name: str, parts: tuple[Any, ...]) -> str:
     return "X Y Z X Y Z" if len(parts) == 6 else " ".join(_PLACEHOLDERS.get(part, "VALUE") for part in parts)
 
 
-def _default_of(field: dataclasses.Field[Any]) -> Any:
-    return field.default_factory() if field.default_factory is not dataclasses.MISSING else field.default
-
-
-def _is_missing(value: Any) -> bool:
-    """Whether a value must be given: dataclasses' mark, or tyro's."""
-    return value is dataclasses.MISSING or value is tyro.MISSING
-
-
 def _default_text(value: Any, text: str) -> str:
-    if _is_missing(value):
-        return " (required)"
     if value is None or value == () or "efault:" in text:
         return ""
     values = value if isinstance(value, tuple) else [value]

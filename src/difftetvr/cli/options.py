@@ -22,8 +22,9 @@ from tyro.constructors import (
     UnsupportedTypeAnnotationError,
 )
 
-from difftetvr.cli.help import Groups, options_of
+from difftetvr.cli.arguments import Groups, arguments_of
 from difftetvr.errors import CaptureError
+from difftetvr.fitting.config import BACKGROUND_COLORS
 from difftetvr.terminal import waiting
 
 if TYPE_CHECKING:
@@ -43,7 +44,6 @@ Color = Literal["black", "white"] | tuple[float, float, float]
 """Of a background: its name, or R G B as the picture's are, linear or sRGB-encoded."""
 
 _NONE = "None"
-_COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
 CAPTURE_GROUPS: Groups = {
     "How photographs are read": ("downscale", "format", "bounds", "test-every"),
@@ -156,7 +156,7 @@ def color_of(background: Color) -> tuple[float, float, float]:
     Raises:
         CaptureError: It is not finite.
     """
-    rgb = _COLORS[background] if isinstance(background, str) else background
+    rgb = BACKGROUND_COLORS[background] if isinstance(background, str) else background
     if not all(math.isfinite(value) for value in rgb):
         given = " ".join(f"{value:g}" for value in rgb)
         raise CaptureError(f"--background is {given}; give black, white or three finite numbers.")
@@ -204,7 +204,7 @@ def parse(kind: type, name: str, args: Sequence[str], default: Any = None) -> An
 
 def _positionals_first(kind: type, args: Sequence[str]) -> list[str]:
     """Arguments in an order in which options that take one word or several cannot take positional ones for theirs."""
-    several = {f"--{option.name}": count for option in options_of(kind) if (count := _several(option.declared))}
+    several = {f"--{a.name}": count for a in arguments_of(kind) if (count := _several(a.declared))}
     left = list(args)
     moved: list[str] = []
     for at in reversed([i for i, word in enumerate(left) if word in several]):

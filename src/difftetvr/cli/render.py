@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from difftetvr.cli.help import Groups
+from difftetvr.cli.arguments import Groups
 from difftetvr.cli.options import Color, MeshOptions, Output, color_of
 from difftetvr.errors import CameraError, CaptureError, MeshError, counted
 from difftetvr.files import require_writable

@@ -28,7 +28,9 @@ Background = Literal["black", "white", "random"] | tuple[float, float, float]
 
 # Independent streams of random numbers.
 _VIEW_STREAM, _BACKGROUND_STREAM, _REFINEMENT_STREAM = range(3)
-_BACKGROUND_COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+BACKGROUND_COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+"""R G B of the backgrounds that have names."""
+
 # Least and greatest value of options that count something.
 _RANGES = {
     "cells": (1, MAX_CELLS),
@@ -264,7 +266,7 @@ class FitConfig:
     def evaluation_background(self) -> tuple[float, float, float]:
         """Background of held-out images: the given one, white where training uses random ones."""
         if self.background is None or isinstance(self.background, str):
-            return _BACKGROUND_COLORS["black" if self.background in (None, "black") else "white"]
+            return BACKGROUND_COLORS["black" if self.background in (None, "black") else "white"]
         return self.background
 
     def require_same_run(self, other: FitConfig) -> None:
