@@ -7,6 +7,7 @@ from . import fitting as fitting
 from . import mesh as mesh
 from . import optics as optics
 from . import rendering as rendering
+from . import trust as trust
 from . import view as view
 from ._version import __version__ as __version__
 from .capture.capture import Capture as Capture
@@ -35,6 +36,7 @@ from .rendering.api import RenderedImage as RenderedImage
 from .rendering.api import render as render
 from .rendering.cameras.pinhole import Camera as Camera
 from .rendering.scalar_field import ScalarField as ScalarField
+from .trust import trusting as trusting
 
 __all__ = [
     "BackendError",
@@ -64,4 +66,5 @@ __all__ = [
     "load_mesh",
     "render",
     "save",
+    "trusting",
 ]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,6 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from difftetvr.archive import read_arrays
 from difftetvr.capture.packed import PackedImages
 from difftetvr.errors import CameraError, CaptureError
 from difftetvr.files import atomic_write
@@ -20,16 +19,7 @@ from difftetvr.rendering.cameras.pinhole import Camera
 _VERSION = 3
 _NEEDED = ("version", "images", "test", "bounds", "name", "density_unit", "world_to_camera", "intrinsics")
 _OPTIONAL = ("alphas", "valid", "points", "point_colors")
-_DAMAGE = (
-    ValueError,
-    EOFError,
-    KeyError,
-    TypeError,
-    SyntaxError,
-    NotImplementedError,
-    zipfile.BadZipFile,
-    zlib.error,
-)
+_KNOWN = (*_NEEDED, *_OPTIONAL, "encoding", "surroundings")
 
 
 def write_capture(path: str | Path, fields: Mapping[str, Any]) -> None:
@@ -71,7 +61,7 @@ def read_capture(path: str | Path) -> dict[str, Any]:
     Raises:
         CaptureError: The file is missing, damaged, or no capture.
     """
-    content = read_arrays(path)
+    content = read_arrays(path, CaptureError, lambda name, _: name in _KNOWN)
     missing = [key for key in _NEEDED if key not in content]
     if missing:
         raise CaptureError(f"'{path}' is no saved capture: it has no array '{missing[0]}'.")
@@ -96,34 +86,8 @@ def read_capture(path: str | Path) -> dict[str, Any]:
         }
     except CameraError as error:
         raise CaptureError(f"A camera in '{path}' is not valid: {error}") from None
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise CaptureError(f"An array in '{path}' has the wrong shape or type; get the file anew.") from None
-
-
-def read_arrays(path: str | Path) -> dict[str, np.ndarray]:
-    """All arrays of an .npz archive.
-
-    Raises:
-        CaptureError: The file is missing, damaged, or no archive.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            if not isinstance(archive, np.lib.npyio.NpzFile):
-                raise ValueError
-            return {key: archive[key] for key in archive.files}
-    except OSError as error:
-        raise CaptureError(f"Cannot read the capture '{path}': {error.strerror or error}.") from None
-    except _DAMAGE:
-        raise CaptureError(f"'{path}' is damaged or no capture saved by difftetvr; get the file anew.") from None
-
-
-def array_names(path: str | Path) -> set[str]:
-    """Names of the arrays in an .npz archive; none for what cannot be read."""
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            return set(archive.files) if isinstance(archive, np.lib.npyio.NpzFile) else set()
-    except (OSError, *_DAMAGE):
-        return set()
 
 
 def _array(values: torch.Tensor | PackedImages) -> np.ndarray:

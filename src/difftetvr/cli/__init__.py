@@ -13,9 +13,10 @@ from collections.abc import Sequence
 from typing import Any
 
 from difftetvr._version import __version__
-from difftetvr.cli.options import parse
+from difftetvr.cli.options import TrustOptions, parse
 from difftetvr.errors import DiffTetError, FitError
 from difftetvr.terminal import console, sentence_for, waiting
+from difftetvr.trust import trusting
 
 __all__ = ["COMMANDS", "command_type", "main", "parse_command"]
 
@@ -83,7 +84,9 @@ def main(args: Sequence[str] | None = None) -> int:
         if out.is_terminal:
             with waiting(out, "Loading PyTorch"):
                 importlib.import_module("torch")
-        command.run(out)
+        trust = getattr(command, "trust", TrustOptions())
+        with trusting(trust.allow_outside, trust.allow_large):
+            command.run(out)
     except SystemExit as leave:
         return leave.code if isinstance(leave.code, int) else _USAGE_ERROR
     except KeyboardInterrupt:

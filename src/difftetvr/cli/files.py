@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from difftetvr.cli.arguments import Groups
-from difftetvr.cli.options import CAPTURE_GROUPS, CaptureOptions, Color, MeshOptions, color_of, load_model
+from difftetvr.cli.options import CAPTURE_GROUPS, CaptureOptions, Color, MeshOptions, TrustOptions, color_of, load_model
 from difftetvr.errors import FitError, MeshError, counted
 from difftetvr.files import require_writable
 from difftetvr.fitting.records.folder import write_json
@@ -37,6 +37,7 @@ class Eval:
     device: str | None = None
     """Where to render."""
     views_of: OmitArgPrefixes[CaptureOptions] = field(default_factory=CaptureOptions)
+    trust: OmitArgPrefixes[TrustOptions] = field(default_factory=TrustOptions)
     groups: ClassVar[Groups] = CAPTURE_GROUPS
 
     def run(self, console: Console) -> None:
@@ -67,6 +68,7 @@ class Info:
     """A mesh (.vtu, .vtk, .msh, .mesh, .xdmf, .npz, .bintet, .ovm, .node), a volume, a capture (.npz), or tooth."""
     reading: OmitArgPrefixes[MeshOptions] = field(default_factory=MeshOptions)
     views_of: OmitArgPrefixes[CaptureOptions] = field(default_factory=CaptureOptions)
+    trust: OmitArgPrefixes[TrustOptions] = field(default_factory=TrustOptions)
     groups: ClassVar[Groups] = CAPTURE_GROUPS
 
     def run(self, console: Console) -> None:
@@ -101,6 +103,7 @@ class Export:
     without_harmonics: bool = False
     """Leave out what colours owe to the direction, which only .vtu and .npz can hold."""
     reading: OmitArgPrefixes[MeshOptions] = field(default_factory=MeshOptions)
+    trust: OmitArgPrefixes[TrustOptions] = field(default_factory=TrustOptions)
 
     def run(self, console: Console) -> None:
         """Reads and writes."""

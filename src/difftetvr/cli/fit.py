@@ -13,7 +13,7 @@ import tyro
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from difftetvr.cli.arguments import Groups
-from difftetvr.cli.options import CAPTURE_GROUPS, CaptureOptions
+from difftetvr.cli.options import CAPTURE_GROUPS, CaptureOptions, TrustOptions
 from difftetvr.cli.saved import SavedRun, saved_run
 from difftetvr.errors import FitError, counted
 from difftetvr.fitting.config import CHOSEN_FOR_CAPTURE, FitConfig, Refine
@@ -46,6 +46,7 @@ class Fit:
     """Go on with the run in the output folder; options that are not given are taken from it."""
     overwrite: bool = False
     """Replace the run in the output folder."""
+    trust: OmitArgPrefixes[TrustOptions] = field(default_factory=TrustOptions)
     groups: ClassVar[Groups] = {
         "Most used": (
             *("output", "cells", "iterations", "downscale", "transfer-function"),

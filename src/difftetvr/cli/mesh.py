@@ -6,15 +6,15 @@ import contextlib
 import io
 import math
 import zipfile
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from tyro.conf import Positional, arg
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from difftetvr.cli.options import Output
+from difftetvr.cli.options import Output, TrustOptions
 from difftetvr.errors import MeshError, counted
 from difftetvr.files import require_writable
 from difftetvr.terminal import waiting
@@ -50,6 +50,8 @@ class Mesh:
     """Length of edges inside; default: 1/20 of the bounding box's diagonal."""
     tolerance: float = 1e-3
     """How far ftetwild may leave the surface, in diagonals of its bounding box."""
+
+    trust: OmitArgPrefixes[TrustOptions] = field(default_factory=TrustOptions)
 
     def run(self, console: Console) -> None:
         """Reads, meshes and writes."""

@@ -45,14 +45,29 @@ Color = Literal["black", "white"] | tuple[float, float, float]
 
 _NONE = "None"
 
+TRUST_GROUPS: Groups = {"How far files are trusted": ("allow-outside", "allow-large")}
+"""Where `TrustOptions` stand in the help of a command."""
+
 CAPTURE_GROUPS: Groups = {
     "How photographs are read": ("downscale", "format", "bounds", "test-every"),
     "How a volume is read and seen": (
         *("transfer-function", "shape", "dtype", "spacing", "attenuation"),
         *("views", "width", "height", "radius", "orbit"),
     ),
+    **TRUST_GROUPS,
 }
-"""Where `CaptureOptions` stand in the help of a command."""
+"""Where `CaptureOptions` and `TrustOptions` stand in the help of a command."""
+
+
+@dataclass(frozen=True)
+class TrustOptions:
+    """How far files from strangers are trusted."""
+
+    allow_outside: Path | None = None
+    """Folder below which files may lie that another file names; default: only in the folder of the file that names
+    them."""
+    allow_large: bool = False
+    """Unpack compressed data to more than 1 GiB and 20 times the size of the file."""
 
 
 @dataclass(frozen=True)
@@ -132,6 +147,8 @@ class MeshOptions:
 
     split: bool = False
     """Split hexahedra, wedges and pyramids into tetrahedra, straighten quadratic cells."""
+    step: int | None = None
+    """Time step to read of a file that has several, from 0; negative ones count from the last; default: the last."""
 
     def load(self, path: Path, console: Console | None = None, *, require_field: bool = False) -> MeshData:
         """Reads a mesh with its data, less its flat cells, which show nothing.
@@ -143,7 +160,7 @@ class MeshOptions:
         """
         from difftetvr.mesh.io import load_data
 
-        data = load_data(path, split=self.split, flat="drop", require_field=require_field)
+        data = load_data(path, split=self.split, flat="drop", step=self.step, require_field=require_field)
         if console is not None:
             for warning in data.warnings:
                 console.print(warning)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from difftetvr.cli.arguments import Groups
-from difftetvr.cli.options import CAPTURE_GROUPS, CaptureOptions, Color, Output, color_of, load_model
+from difftetvr.cli.options import CAPTURE_GROUPS, CaptureOptions, Color, Output, TrustOptions, color_of, load_model
 from difftetvr.errors import CaptureError, counted
 from difftetvr.files import require_writable
 
@@ -43,6 +43,7 @@ class Compare:
     device: str | None = None
     """Where to render."""
     views_of: OmitArgPrefixes[CaptureOptions] = field(default_factory=CaptureOptions)
+    trust: OmitArgPrefixes[TrustOptions] = field(default_factory=TrustOptions)
     groups: ClassVar[Groups] = CAPTURE_GROUPS
 
     def run(self, console: Console) -> None:

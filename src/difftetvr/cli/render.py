@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from difftetvr.cli.arguments import Groups
-from difftetvr.cli.options import Color, MeshOptions, Output, color_of
+from difftetvr.cli.options import TRUST_GROUPS, Color, MeshOptions, Output, TrustOptions, color_of
 from difftetvr.errors import CameraError, CaptureError, MeshError, counted
 from difftetvr.files import require_writable
 
@@ -117,10 +117,12 @@ class Render:
     """Where to render, such as cpu or cuda; default: the best that works."""
     scalars: OmitArgPrefixes[ScalarOptions] = field(default_factory=ScalarOptions)
     mesh: OmitArgPrefixes[MeshOptions] = field(default_factory=MeshOptions)
+    trust: OmitArgPrefixes[TrustOptions] = field(default_factory=TrustOptions)
     groups: ClassVar[Groups] = {
         "Camera": ("eye", "target", "up", "fov", "width", "height"),
         "Scalars of a simulation": ("scalar", "transfer-function", "value-range", "attenuation"),
-        "How it is drawn": ("background", "clip", "show", "renderer", "split", "device"),
+        "How it is drawn": ("background", "clip", "show", "renderer", "split", "step", "device"),
+        **TRUST_GROUPS,
     }
 
     def run(self, console: Console) -> None:

@@ -62,6 +62,7 @@ class _Request:
     dtype: torch.dtype
     split: bool
     flat: Flat
+    step: int | None = None
 
 
 @dataclass(frozen=True)
@@ -126,6 +127,7 @@ def load_data(
     *,
     split: bool = False,
     flat: Flat = "refuse",
+    step: int | None = None,
     require_field: bool = False,
 ) -> MeshData:
     """Reads a mesh with all data of its vertices and cells, such as the scalars of a simulation.
@@ -135,6 +137,8 @@ def load_data(
         dtype: Floating-point type of the mesh, its field and its data.
         split: As for `load`.
         flat: As for `load`.
+        step: Time step to read of a file that has several, from 0; negative ones count from the last; None: the last,
+            with a warning.
         require_field: Insist on ``color`` and ``density``, as `load` does. Else arrays of these names that cannot
             be rendered are data like any other, and a warning says so.
 
@@ -144,7 +148,7 @@ def load_data(
     Raises:
         MeshError: As `load`.
     """
-    request = _Request(Path(path), dtype, split, flat)
+    request = _Request(Path(path), dtype, split, flat, step)
     data, problem = _load(request)
     if require_field:
         if problem is not None:
@@ -163,7 +167,7 @@ def load_data(
 
 def _load(request: _Request) -> tuple[MeshData, MeshError | None]:
     """The mesh with its data, and what keeps ``color`` and ``density`` from being its field where the file has both."""
-    content = _read(request.path)
+    content = _read(request.path, request.step)
     tets = _tetrahedra(request, content)
     built = _build_mesh(request, _floats(content.vertices, request.dtype), tets)
     mesh, kept = built.mesh, built.kept
@@ -213,13 +217,13 @@ def _build_mesh(request: _Request, points: torch.Tensor, tets: _Tets) -> _Built:
     return _Built(mesh, {"vertex": used.numpy(), "cell": tets.rows}, tets.notes, flat_cells)
 
 
-def _read(path: Path) -> Content:
+def _read(path: Path, step: int | None) -> Content:
     if path.is_dir():
         raise MeshError(f"{path} is a folder; give the mesh file in it.")
     if not path.is_file():
         raise MeshError(f"There is no mesh file {path}; check the path.")
     try:
-        content = format_of(path).read(path)
+        content = format_of(path).content(path, step)
     except OSError as error:
         reason = error.strerror or type(error).__name__
         raise MeshError(f"{path} cannot be read ({reason}); check the disk and the file's permissions.") from error
@@ -232,7 +236,7 @@ def _tetrahedra(request: _Request, content: Content) -> _Tets:
     if not volumes:
         found = ", ".join(sorted({block.kind for block in content.cells})) or "no cells"
         raise MeshError(f"{request.path} holds no tetrahedra (found: {found}); give a tetrahedral volume mesh.")
-    nodes, rows, notes = [], [], []
+    nodes, rows, notes = [], [], list(content.notes)
     for block in volumes:
         _require_convertible(request, block, len(content.vertices))
         if is_quadratic(block.kind):

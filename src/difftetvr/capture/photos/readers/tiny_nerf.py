@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from difftetvr.capture.capture_file import array_names, read_arrays
+from difftetvr.archive import array_names, read_arrays
 from difftetvr.capture.photos.lens import Intrinsics, Lens
 from difftetvr.capture.photos.poses import from_opengl
 from difftetvr.errors import CaptureError
@@ -49,7 +49,7 @@ def read_tiny_nerf(path: Path, downscale: int = 1) -> TinyNerf:
     Raises:
         CaptureError: An array is missing or not valid.
     """
-    content = read_arrays(path)
+    content = read_arrays(path, CaptureError, lambda name, _: name in _KEYS)
     for key in _KEYS:
         if key not in content or content[key].dtype.kind not in "fui":
             raise CaptureError(f"'{path}' has no numbers '{key}'; a tiny NeRF archive has {', '.join(_KEYS)}.")

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import zipfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from difftetvr.archive import array_names, read_arrays
 from difftetvr.errors import MeshError
 from difftetvr.mesh.io.content import Content, Output, require_array, tetra_block
 
 _VERTICES = ("vertices", "points")
 _TETS = ("tets", "cells")
-# The most that the compression of .zip files can win.
-_LARGEST_RATIO = 1032
+_NAMED = ("location", "color", "density", "harmonics")
 
 
 def read(path: Path) -> Content:
@@ -32,11 +31,8 @@ def read(path: Path) -> Content:
     Raises:
         MeshError: The file is damaged, lacks an array, or one has a wrong shape.
     """
-    try:
-        arrays = _arrays(path)
-    # What damaged archives raise is for zipfile, zlib, ast and tokenize to decide, and no list of it is complete.
-    except Exception as error:
-        raise MeshError(f"{path} is no intact numpy archive of plain arrays; write it again with save.") from error
+    counts = _row_counts(path)
+    arrays = read_arrays(path, MeshError, lambda name, shape: name in _NAMED or shape[:1] in counts)
     vertices, tets = (_pop(path, arrays, names) for names in (_VERTICES, _TETS))
     require_array(path, "vertices", vertices, 3)
     require_array(path, "tetrahedra", tets, 4, "iu")
@@ -59,11 +55,8 @@ def is_mesh_archive(path: Path) -> bool:
     Args:
         path: The file; what is no archive holds no mesh.
     """
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            return any(n in archive for n in _VERTICES) and any(n in archive for n in _TETS)
-    except (ValueError, OSError, EOFError, TypeError, zipfile.BadZipFile):
-        return False
+    names = array_names(path)
+    return any(n in names for n in _VERTICES) and any(n in names for n in _TETS)
 
 
 def write(path: Path, output: Output) -> None:
@@ -80,27 +73,17 @@ def write(path: Path, output: Output) -> None:
         np.savez_compressed(file, **arrays)
 
 
-def _arrays(path: Path) -> dict[str, np.ndarray]:
-    with zipfile.ZipFile(path) as archive:
-        for member in archive.infolist():
-            if member.file_size > _LARGEST_RATIO * (member.compress_size + 1):
-                raise ValueError("it announces more than it can hold")
-            with archive.open(member) as file:
-                _require_honest_header(file, member.file_size)
-    with np.load(path, allow_pickle=False) as arrays:
-        return {name: arrays[name] for name in arrays.files}
+def _row_counts(path: Path) -> set[tuple[int, ...]]:
+    """Numbers of vertices and of cells, each as a shape: what has another number of rows does not belong here."""
+    counts: set[tuple[int, ...]] = set()
 
+    def note(name: str, shape: tuple[int, ...]) -> bool:
+        if name in (*_VERTICES, *_TETS):
+            counts.add(shape[:1])
+        return False
 
-def _require_honest_header(file: Any, size: int) -> None:
-    """Numpy allocates what an array's header announces before it reads; so look whether that much is there."""
-    version = np.lib.format.read_magic(file)
-    read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, _, dtype = read_header(file)
-    count = 1
-    for length in shape:
-        count *= length
-    if not 0 <= count * dtype.itemsize <= size:
-        raise ValueError("it announces more than it holds")
+    read_arrays(path, MeshError, note)
+    return counts
 
 
 def _pop(path: Path, arrays: dict[str, np.ndarray], names: tuple[str, ...]) -> np.ndarray:

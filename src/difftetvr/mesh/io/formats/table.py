@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from difftetvr.errors import MeshError
 from difftetvr.mesh.io.content import Content, Output
 from difftetvr.mesh.io.formats import bintet, gmsh, medit, npz, ovm, tetgen, through_meshio, vtk
 
@@ -16,18 +17,36 @@ class Format:
     """What is known about the files of one suffix.
 
     Attributes:
-        read: From a file to its content.
+        read: From a file to its content; where the format has time steps, from a file and the step to read, too.
         write: From a mesh to a file; None for formats that are only read.
         holds_field: Whether it holds colour and density beside the geometry.
         holds_harmonics: Whether it holds what colours owe to the direction, too.
         is_single: Whether it holds float32 only.
+        has_steps: Whether a file may hold several time steps; see `difftetvr.mesh.io.content.chosen_step`.
     """
 
-    read: Callable[[Path], Content]
+    read: Callable[..., Content]
     write: Callable[[Path, Output], None] | None = None
     holds_field: bool = True
     holds_harmonics: bool = False
     is_single: bool = False
+    has_steps: bool = False
+
+    def content(self, path: Path, step: int | None) -> Content:
+        """Read a file.
+
+        Args:
+            path: The file.
+            step: Its time step to read, from 0; negative ones count from the last; None: the last.
+
+        Raises:
+            MeshError: It cannot be read, or has no such step.
+        """
+        if self.has_steps:
+            return self.read(path, step)
+        if step is not None:
+            raise MeshError(f"{path} has no time steps, as files of this kind have none; leave out --step.")
+        return self.read(path)
 
 
 def format_of(path: Path) -> Format:
