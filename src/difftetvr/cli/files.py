@@ -92,14 +92,14 @@ class Info:
 
 @dataclass(frozen=True)
 class Export:
-    """Write a mesh, with color and density if it has them, in another format."""
+    """Write a mesh with its data, color and density among them if it has them, in another format."""
 
     model: Annotated[Path, Positional, arg(metavar="MODEL")]
     """Mesh, in any format that is read."""
     output: Annotated[Path, Positional, arg(metavar="OUT")]
     """File to write: .vtu, .vtk, .msh, .xdmf, .npz, .bintet, .ovm or .node with its .ele; .mesh with --geometry."""
     geometry: bool = False
-    """Leave out color and density."""
+    """Leave out color, density and all other data."""
     without_harmonics: bool = False
     """Leave out what colours owe to the direction, which only .vtu and .npz can hold."""
     reading: OmitArgPrefixes[MeshOptions] = field(default_factory=MeshOptions)
@@ -107,7 +107,7 @@ class Export:
 
     def run(self, console: Console) -> None:
         """Reads and writes."""
-        from difftetvr.mesh.io import FIELD_ARRAYS, HARMONICS, require_writable_format, save
+        from difftetvr.mesh.io import FIELD_ARRAYS, HARMONICS, holds_data, require_writable_format, save
 
         require_writable_format(self.output, with_field=False)
         require_writable(self.output, MeshError)
@@ -117,12 +117,17 @@ class Export:
             field_on_mesh = dataclasses.replace(field_on_mesh, harmonics=None)
         if field_on_mesh is not None:
             require_writable_format(self.output)
-        save(self.output, data.mesh, field_on_mesh)
         written = () if field_on_mesh is None else FIELD_ARRAYS
         if field_on_mesh is not None and field_on_mesh.harmonics is not None:
             written = (*written, HARMONICS)
+        of_field = (*FIELD_ARRAYS, HARMONICS) if data.field is not None else ()
+        others = [{n: v for n, v in d.items() if n not in of_field} for d in (data.point_data, data.cell_data)]
+        if self.geometry or not holds_data(self.output):
+            others = [{}, {}]
+        save(self.output, data.mesh, field_on_mesh, point_data=others[0], cell_data=others[1])
+        written = (*written, *sorted({*others[0], *others[1]}))
         left_out = sorted({*data.point_data, *data.cell_data}.difference(written))
-        content = " and ".join(written) or "geometry only"
+        content = ", ".join(written) or "geometry only"
         without = f", without {', '.join(left_out)}" if left_out else ""
         console.print(f"Wrote {self.output} ({counted(data.mesh.num_cells, 'cell')}, {content}{without})")
 

@@ -85,6 +85,13 @@ class Field:
         wanted = " or ".join(f"{counts[location]} for one per {location}" for location in candidates)
         raise MeshError(f"The field has {counted(len(self), 'value')}, but this mesh needs {wanted}.")
 
+    def arrays(self) -> dict[str, torch.Tensor]:
+        """What files keep of it, by name: (N, 3) ``color``, (N,) ``density``, (N, 3 B) ``harmonics`` if it has any."""
+        arrays = {"color": self.color, "density": self.density}
+        if self.harmonics is not None:
+            arrays["harmonics"] = self.harmonics.flatten(1)
+        return arrays
+
     def validate(self, mesh: TetMesh) -> None:
         """Check that the field belongs to the mesh and holds values that can be rendered.
 

@@ -10,6 +10,7 @@ import torch
 from difftetvr.errors import MeshError
 from difftetvr.mesh import quality, validation
 from difftetvr.mesh.arrays import true_indices
+from difftetvr.mesh.frame import WORLD, Origin, origin_for, reoriented
 from difftetvr.mesh.topology.topology import Topology
 
 
@@ -21,16 +22,20 @@ class TetMesh:
     they may overlap, hang and share faces as they like, and whatever asks for their neighbours raises `MeshError`.
 
     Attributes:
-        vertices: (V, 3) float32 or float64 positions; may require grad.
+        vertices: (V, 3) float32 or float64 positions relative to ``origin``; may require grad.
         tets: (T, 4) int32 vertex indices, det(v1 - v0, v2 - v0, v3 - v0) > 0. Read-only: kernels trust it.
         topology: Adjacency and incidence tables, shared by all meshes made by `with_vertices`.
+        origin: Point of world space that vertices are relative to; (0, 0, 0) but for float32 meshes that lie so far
+            from it that single precision would not resolve them. Cameras, clip planes, `bounds`, `positions` and files
+            speak of world space.
     """
 
     vertices: torch.Tensor
     tets: torch.Tensor
     topology: Topology
+    origin: Origin
 
-    def __init__(self, vertices: Any, tets: Any, *, conforming: bool = True) -> None:
+    def __init__(self, vertices: Any, tets: Any, *, conforming: bool = True, origin: Origin = WORLD) -> None:
         """Build a mesh from arrays, check it, and orient its cells.
 
         Cells of negative volume get their last two vertices swapped; their order and all else stays. A volume counts as
@@ -41,13 +46,14 @@ class TetMesh:
                 included; lists and other dtypes become float32.
             tets: (T, 4) integer vertex indices, array-like; copied.
             conforming: False for loose cells, whose faces are not matched and not checked.
+            origin: Point of world space that the vertices are relative to.
 
         Raises:
             MeshError: Names the first offending cell: index out of range, vertex not finite, repeated vertex, zero
                 volume, face shared by three cells, overlap with a neighbour (the last two not for loose cells). Also
                 for wrong shapes and dtypes.
         """
-        points = validation.as_vertices(vertices)
+        points = validation.as_vertices(vertices, unrounded=True)
         cells = validation.as_tets(tets, points.shape[0], points.device)
         validation.check_finite(points, cells)
         signs = validation.orientations(points, cells)
@@ -56,10 +62,13 @@ class TetMesh:
         topology = Topology(cells, points.shape[0], is_conforming=conforming)
         if conforming:
             topology.cell_adjacency  # noqa: B018  pairs all faces, and so finds every one that cannot be
-        self._assign(points, topology)
+        self._assign(points, topology, origin)
+        if not validation.is_stored_in_floats(vertices):
+            single = self.to(dtype=torch.float32)
+            self._assign(single.vertices, single.topology, single.origin)
 
     @classmethod
-    def from_valid(cls, vertices: torch.Tensor, topology: Topology) -> TetMesh:
+    def from_valid(cls, vertices: torch.Tensor, topology: Topology, origin: Origin = WORLD) -> TetMesh:
         """Wrap what is known to make a valid mesh, unchecked: for code that changes meshes and keeps them valid.
 
         Kernels gather unchecked, so an index out of range here reads foreign memory.
@@ -67,12 +76,13 @@ class TetMesh:
         Args:
             vertices: (V, 3) float32 or float64 positions.
             topology: Topology of positively oriented cells on the device of the vertices.
+            origin: Point of world space that the vertices are relative to.
 
         Returns:
             The mesh.
         """
         mesh = cls.__new__(cls)
-        mesh._assign(vertices, topology)
+        mesh._assign(vertices, topology, origin)
         return mesh
 
     @classmethod
@@ -145,7 +155,7 @@ class TetMesh:
         """The same cells at other positions; costs nothing and checks nothing but the shape (see `validate`).
 
         Args:
-            vertices: (V, 3) float32 or float64 on the mesh's device; may require grad.
+            vertices: (V, 3) float32 or float64 on the mesh's device, relative to its origin; may require grad.
 
         Returns:
             A mesh that shares this one's topology.
@@ -160,7 +170,35 @@ class TetMesh:
             )
         if vertices.dtype not in (torch.float32, torch.float64):
             raise MeshError(f"The new vertices are {vertices.dtype}; pass float32 or float64.")
-        return TetMesh.from_valid(vertices, self.topology)
+        return TetMesh.from_valid(vertices, self.topology, self.origin)
+
+    @property
+    def positions(self) -> torch.Tensor:
+        """(V, 3) float64 positions of the vertices in world space; differentiable."""
+        return reoriented(self.vertices, self.origin, WORLD, torch.float64)
+
+    def with_origin(self, origin: Origin | None = None) -> TetMesh:
+        """The same mesh with vertices relative to another point, rounded to their precision.
+
+        Args:
+            origin: Point of world space; None chooses one near the mesh if it is float32 and lies more than 16 of its
+                longest sides from where its vertices are counted from, and else leaves the mesh as it is.
+
+        Raises:
+            MeshError: Rounding flattened or inverted a cell.
+        """
+        if origin is None:
+            if self.vertices.dtype != torch.float32:
+                return self
+            nearer = origin_for(self.vertices)
+            x, y, z = (a + b for a, b in zip(self.origin, nearer, strict=True))
+            origin = (x, y, z)
+        if origin == self.origin:
+            return self
+        vertices = reoriented(self.vertices, self.origin, origin, self.vertices.dtype)
+        mesh = TetMesh.from_valid(vertices, self.topology, origin)
+        mesh.validate()
+        return mesh
 
     def validate(self) -> None:
         """Check the current positions: all finite, all cells positive.
@@ -181,15 +219,20 @@ class TetMesh:
             This mesh where nothing changes; else one whose vertices autograd sees as a function of these.
 
         Raises:
-            MeshError: dtype is no such dtype, or rounding to float32 flattened or inverted a cell.
+            MeshError: dtype is no such dtype, or rounding to float32 flattened or inverted a cell. A mesh far from its
+                origin gets a nearer one first, see `with_origin`.
         """
         if dtype not in (None, torch.float32, torch.float64):
             raise MeshError(f"A mesh cannot have {dtype} vertices; use torch.float32 or torch.float64.")
-        vertices = self.vertices.to(device=device, dtype=dtype)
+        rounds = dtype == torch.float32 and self.vertices.dtype == torch.float64
+        nearer = origin_for(self.vertices) if rounds else WORLD
+        near = self.vertices if nearer == WORLD else reoriented(self.vertices, WORLD, nearer, torch.float64)
+        vertices = near.to(device=device, dtype=dtype)
         if vertices is self.vertices:
             return self
-        mesh = TetMesh.from_valid(vertices, self.topology.to(vertices.device))
-        if vertices.dtype == torch.float32 and self.vertices.dtype == torch.float64:
+        x, y, z = (a + b for a, b in zip(self.origin, nearer, strict=True))
+        mesh = TetMesh.from_valid(vertices, self.topology.to(vertices.device), (x, y, z))
+        if rounds:
             mesh.validate()
         return mesh
 
@@ -208,7 +251,7 @@ class TetMesh:
         renumbered = used.cumsum(0, dtype=torch.int32) - 1
         adjacency = self.topology.cell_adjacency if self.is_conforming else None
         topology = Topology(renumbered[self.tets], kept.numel(), adjacency, is_conforming=self.is_conforming)
-        return TetMesh.from_valid(self.vertices[kept], topology), kept
+        return TetMesh.from_valid(self.vertices[kept], topology, self.origin), kept
 
     def volumes(self) -> torch.Tensor:
         """(T,) volumes of the cells in cubed units of length; differentiable."""
@@ -227,17 +270,22 @@ class TetMesh:
         return quality.quality(self.vertices, self.tets)
 
     def bounds(self) -> torch.Tensor:
-        """(2, 3) lowest and highest coordinates of the vertices, detached."""
+        """(2, 3) lowest and highest coordinates of the vertices in world space, detached.
+
+        In the precision of the vertices, but float64 for a mesh with an origin of its own.
+        """
         vertices = self.vertices.detach()
-        return torch.stack((vertices.amin(0), vertices.amax(0)))
+        bounds = torch.stack((vertices.amin(0), vertices.amax(0)))
+        return bounds if self.origin == WORLD else reoriented(bounds, self.origin, WORLD, torch.float64)
 
     def __repr__(self) -> str:
         """Sizes, precision and device."""
         sizes = f"{self.num_vertices} vertices, {self.num_cells} cells"
         return f"TetMesh({sizes}, {self.vertices.dtype}, {self.vertices.device})"
 
-    def _assign(self, vertices: torch.Tensor, topology: Topology) -> None:
+    def _assign(self, vertices: torch.Tensor, topology: Topology, origin: Origin) -> None:
         self.vertices = vertices
+        self.origin = origin
         self.tets = topology.tets
         self.topology = topology
 

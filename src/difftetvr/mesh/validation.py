@@ -19,11 +19,12 @@ Rounding differences, products and sums costs less than 20 units of 2**-53 of th
 """
 
 
-def as_vertices(vertices: Any) -> torch.Tensor:
+def as_vertices(vertices: Any, *, unrounded: bool = False) -> torch.Tensor:
     """Vertex positions as a tensor; one that is float32 or float64 already is returned as it is, with its graph.
 
     Args:
         vertices: (V, 3) array-like of real numbers.
+        unrounded: Return lists and numbers of other types as float64; else they become float32.
 
     Returns:
         (V, 3) float32 or float64.
@@ -36,7 +37,16 @@ def as_vertices(vertices: Any) -> torch.Tensor:
         raise MeshError(f"The vertices have shape {tuple(tensor.shape)}; pass positions of shape (V, 3).")
     if tensor.is_complex() or tensor.dtype == torch.bool:
         raise MeshError(f"The vertices are {tensor.dtype}; pass positions as float32 or float64.")
-    return tensor if tensor.dtype in (torch.float32, torch.float64) else tensor.to(torch.float32)
+    if is_stored_in_floats(vertices):
+        return tensor
+    return tensor.to(torch.float64 if unrounded else torch.float32)
+
+
+def is_stored_in_floats(values: Any) -> bool:
+    """Whether an array or a tensor is float32 or float64 already."""
+    if isinstance(values, torch.Tensor):
+        return values.dtype in (torch.float32, torch.float64)
+    return isinstance(values, np.ndarray) and values.dtype.kind == "f" and values.dtype.itemsize in (4, 8)
 
 
 def as_tets(tets: Any, num_vertices: int, device: torch.device) -> torch.Tensor:
@@ -182,8 +192,6 @@ def _as_tensor(values: Any, what: str) -> torch.Tensor:
         array = np.asarray(values)
         if array.dtype.kind == "u":
             array = array.astype(np.int64)
-        elif array.dtype.kind == "f" and not isinstance(values, np.ndarray):
-            array = array.astype(np.float32)
         # Torch takes neither foreign byte orders nor negative strides.
         return torch.from_numpy(np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("=")))
     except (TypeError, ValueError) as error:

@@ -19,6 +19,8 @@ from difftetvr.rendering.clip_plane import clip_limits
 from difftetvr.rendering.scalar_field import ScalarField
 
 RENDERERS = tuple(TRACERS)
+_REMOTE = 64.0  # distances of sizes of the mesh from which float32 loses more than the tests allow it
+_KNOW_FLOAT64 = ("cpu", "cuda")
 _SMALL = 1e-6  # within this and its inverse, coordinates are left as they are
 
 
@@ -86,7 +88,8 @@ def render(
     behind = as_background(background, mesh.vertices)
     limits = view.limits(clip_plane)
     light, distance = RenderFunction.apply(view.task, view.vertices, limits, *view.parts)
-    return compose(light, _times(distance, view.unit), behind)
+    dtype = mesh.vertices.dtype
+    return compose(light.to(dtype), _times(distance, view.unit).to(dtype), behind)
 
 
 @dataclass(frozen=True)
@@ -107,7 +110,9 @@ class PreparedView:
 
     def limits(self, clip_plane: Any) -> torch.Tensor | None:
         """What :func:`difftetvr.rendering.clip_plane.clip_limits` says of a plane, in that unit; None without one."""
-        return None if clip_plane is None else clip_limits(clip_plane, self.task.camera, self.vertices) / self.unit
+        if clip_plane is None:
+            return None
+        return clip_limits(clip_plane, self.task.camera, self.vertices, self.task.mesh.origin) / self.unit
 
 
 def prepare_view(
@@ -122,25 +127,49 @@ def prepare_view(
     """Check a view's inputs and bring them into camera space; arguments and errors are those of :func:`render`."""
     if not 0.0 <= transmittance_threshold < 1.0:
         raise DiffTetError(f"transmittance_threshold is {transmittance_threshold}; it must lie in [0, 1).")
+    camera = camera.relative_to(mesh.origin)
     content, parts = _content(mesh, field, camera)
     for tensor in parts:
         if tensor.device != mesh.vertices.device:
             raise MeshError(
                 f"The field is on '{tensor.device}', the mesh on '{mesh.vertices.device}'; move one of them."
             )
-    backend = backend_for(mesh.vertices)
+    positions = _camera_space(mesh, camera)
+    backend = backend_for(positions)
     parts = tuple(part.to(backend.dtype) for part in parts)
     if content != "scalar":
         Field(parts[0], parts[1], content).validate(mesh)
     if optics is None:
         optics = ConstantPerCell() if content == "cell" else ExactLinear()
     task = RenderTask(backend, mesh, camera, optics, content, transmittance_threshold, deterministic, renderer)
-    vertices, unit = _unit_of_length(camera.to_camera_space(mesh.vertices), mesh)
+    vertices, unit = _unit_of_length(positions, mesh)
     if unit != 1.0 and content == "scalar":
         parts = *parts[:2], torch.cat((parts[2][:, :1] * unit, parts[2][:, 1:]), dim=1)
     elif unit != 1.0:
         parts = parts[0], parts[1] * unit
     return PreparedView(task, vertices, parts, unit)
+
+
+def _camera_space(mesh: TetMesh, camera: Camera) -> torch.Tensor:
+    """(V, 3) vertices in camera space, in float64 where float32 would blur what the camera sees.
+
+    A narrow view from far away sees differences of positions that are much smaller than their distance. Where only the
+    transform cancels, as for a mesh far from the origin that the camera is near to, its result is float32 again.
+    """
+    vertices = mesh.vertices
+    rounded = camera.to_camera_space(vertices)
+    if vertices.dtype != torch.float32 or vertices.device.type not in _KNOW_FLOAT64:
+        return rounded
+    seen = rounded.detach()
+    nearest, farthest = (float(z) for z in torch.aminmax(seen[:, 2]))
+    if nearest > _REMOTE * (farthest - nearest):
+        low, high = torch.aminmax(seen, dim=0)
+        if nearest > _REMOTE * float((high - low).max()):
+            return camera.to_camera_space(vertices.double())
+    shift = float(camera.world_to_camera.detach()[:3, 3].abs().max())
+    if shift > _REMOTE * max(abs(nearest), abs(farthest)):
+        return camera.to_camera_space(vertices.double()).float()
+    return rounded
 
 
 def _content(mesh: TetMesh, field: Field | ScalarField, camera: Camera) -> tuple[Content, tuple[torch.Tensor, ...]]:

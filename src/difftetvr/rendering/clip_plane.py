@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -10,15 +11,18 @@ from difftetvr.errors import DiffTetError
 from difftetvr.rendering.cameras.pinhole import Camera
 
 
-def clip_limits(plane: Any, camera: Camera, like: torch.Tensor) -> torch.Tensor:
+def clip_limits(
+    plane: Any, camera: Camera, like: torch.Tensor, origin: Sequence[float] = (0.0, 0.0, 0.0)
+) -> torch.Tensor:
     """Distances between which each ray lies in a half-space, in front of the camera.
 
     Differentiable in the plane and in the camera's pose: the plane stands still in the world.
 
     Args:
         plane: (4,) a, b, c, d of the half-space a x + b y + c z + d >= 0 in world space.
-        camera: The camera.
+        camera: The camera, relative to ``origin``.
         like: A tensor whose precision and device the result gets.
+        origin: (3,) point of world space that the camera's pose counts from.
 
     Returns:
         (H, W, 2) first and last distance in world units; the second may be infinite, or smaller than the first where a
@@ -36,7 +40,12 @@ def clip_limits(plane: Any, camera: Camera, like: torch.Tensor) -> torch.Tensor:
         raise DiffTetError(f"clip_plane is {plane!r}; give four finite numbers a, b, c, d, the first three not all 0.")
     pose = camera.world_to_camera.to(like)
     normal = pose[:3, :3] @ coefficients[:3]
-    at_camera = coefficients[3] - normal @ pose[:3, 3]
+    offset = coefficients[3]
+    if any(origin):
+        shift = torch.tensor(list(origin), dtype=torch.float64)
+        exact = torch.as_tensor(plane, dtype=torch.float64).cpu()
+        offset = (exact[3] + exact[:3] @ shift).to(like)
+    at_camera = offset - normal @ pose[:3, 3]
     directions = camera.ray_directions().to(like.dtype)  # before the device: not all of them know float64
     slope = directions.to(like.device) @ normal
     # Along a ray the plane's function is slope * t + at_camera.

@@ -42,7 +42,7 @@ class ScalarField:
     def __post_init__(self) -> None:
         scalar = self.scalar
         if not isinstance(scalar, torch.Tensor) or not scalar.is_floating_point():
-            scalar = torch.as_tensor(scalar, dtype=torch.float32)
+            scalar = torch.as_tensor(scalar, dtype=torch.float64)
             object.__setattr__(self, "scalar", scalar)
         if scalar.dim() != 1 or scalar.shape[0] == 0:
             raise MeshError(f"The scalars have shape {tuple(scalar.shape)}; pass one number for each vertex or cell.")
@@ -74,6 +74,10 @@ class ScalarField:
                 return location
         wanted = " or ".join(f"{counts[location]} for one per {location}" for location in candidates)
         raise MeshError(f"There are {self.scalar.shape[0]} scalars, but this mesh needs {wanted}.")
+
+    def arrays(self) -> dict[str, torch.Tensor]:
+        """What files keep of it, by name: (N,) ``scalar``. The transfer function has files of its own."""
+        return {"scalar": self.scalar}
 
     def normalised(self) -> torch.Tensor:
         """The scalars in units of the range, so that the transfer function's [0, 1] spans it; differentiable."""

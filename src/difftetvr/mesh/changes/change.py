@@ -101,7 +101,7 @@ def with_midpoints(mesh: TetMesh, ends: torch.Tensor, tets: torch.Tensor, cell_p
     weight[mesh.num_vertices :] = 0.5
     positions = mesh.vertices.detach()
     midpoints = torch.lerp(positions.index_select(0, ends[:, 0]), positions.index_select(0, ends[:, 1]), 0.5)
-    changed = mesh_of(torch.cat((positions, midpoints)), tets, mesh.is_conforming)
+    changed = mesh_of(torch.cat((positions, midpoints)), tets, mesh)
     return MeshChange(changed, parents, weight, cell_parents, mesh.num_vertices, mesh.num_cells)
 
 
@@ -119,17 +119,17 @@ def with_vertices_kept(mesh: TetMesh, kept: torch.Tensor, topology: Topology, ce
     """
     parents = kept.int()[:, None].expand(-1, 2).contiguous()
     weight = torch.zeros(kept.shape[0], device=kept.device)
-    changed = TetMesh.from_valid(mesh.vertices.detach()[kept], topology)
+    changed = TetMesh.from_valid(mesh.vertices.detach()[kept], topology, mesh.origin)
     return MeshChange(changed, parents, weight, cell_parents, mesh.num_vertices, mesh.num_cells)
 
 
-def mesh_of(vertices: torch.Tensor, tets: torch.Tensor, is_conforming: bool = True) -> TetMesh:
+def mesh_of(vertices: torch.Tensor, tets: torch.Tensor, mesh: TetMesh) -> TetMesh:
     """Wrap cells that are valid by construction.
 
     Args:
         vertices: (V, 3) positions.
         tets: (T, 4) int32.
-        is_conforming: Whether they meet face to face.
+        mesh: What they were made of: they meet face to face, or not, and are counted from where its cells are.
 
     Returns:
         The mesh.
@@ -139,7 +139,8 @@ def mesh_of(vertices: torch.Tensor, tets: torch.Tensor, is_conforming: bool = Tr
     """
     if tets.shape[0] > MAX_CELLS:
         raise MeshError(f"The refined mesh would have {tets.shape[0]} cells, more than {MAX_CELLS}; refine less of it.")
-    return TetMesh.from_valid(vertices, Topology(tets, vertices.shape[0], is_conforming=is_conforming))
+    topology = Topology(tets, vertices.shape[0], is_conforming=mesh.is_conforming)
+    return TetMesh.from_valid(vertices, topology, mesh.origin)
 
 
 def check_indices(indices: torch.Tensor, count: int, what: str) -> torch.Tensor:

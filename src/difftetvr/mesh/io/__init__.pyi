@@ -14,6 +14,8 @@ from .loading import load_mesh as load_mesh
 from .loading import load_with_optional_field as load_with_optional_field
 from .saving import GEOMETRY_SUFFIXES as GEOMETRY_SUFFIXES
 from .saving import WRITABLE_SUFFIXES as WRITABLE_SUFFIXES
+from .saving import Storable as Storable
+from .saving import holds_data as holds_data
 from .saving import require_writable_format as require_writable_format
 from .saving import save as save
 
@@ -24,6 +26,8 @@ __all__ = [
     "WRITABLE_SUFFIXES",
     "Flat",
     "MeshData",
+    "Storable",
+    "holds_data",
     "is_mesh_archive",
     "load",
     "load_data",

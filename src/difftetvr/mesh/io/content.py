@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TextIO
 
 import numpy as np
 
-from difftetvr.errors import MeshError, counted
+from difftetvr.errors import MeshError
 
 _LINES_AT_ONCE = 10_000
 
@@ -56,59 +55,24 @@ class Output:
     Attributes:
         vertices: (V, 3) positions.
         tets: (T, 4) vertex indices of cells with positive volume.
-        arrays: The field's arrays by name, of V or T rows; none where the geometry alone is written.
-        is_per_cell: Whether they belong to the cells.
+        point_data: Arrays of V rows by name, among them those of a field on the vertices.
+        cell_data: Arrays of T rows by name, among them those of a field on the cells.
+        is_per_cell: Whether colour and density belong to the cells.
         path: Where the file will be in the end; a temporary one is written first.
     """
 
     vertices: np.ndarray
     tets: np.ndarray
-    arrays: dict[str, np.ndarray]
+    point_data: dict[str, np.ndarray]
+    cell_data: dict[str, np.ndarray]
     is_per_cell: bool
     path: Path
 
     @property
     def rgba(self) -> np.ndarray | None:
         """(V, 4) or (T, 4) red, green, blue, density; None where there are none."""
-        return np.column_stack((self.arrays["color"], self.arrays["density"])) if self.arrays else None
-
-    @property
-    def point_data(self) -> dict[str, np.ndarray]:
-        """Arrays of the vertices."""
-        return {} if self.is_per_cell else self.arrays
-
-    @property
-    def cell_data(self) -> dict[str, np.ndarray]:
-        """Arrays of the cells."""
-        return self.arrays if self.is_per_cell else {}
-
-
-def chosen_step(path: Path, times: Sequence[float], step: int | None) -> tuple[int, tuple[str, ...]]:
-    """Which of a file's time steps to read.
-
-    Args:
-        path: The file.
-        times: Of its steps, in their order.
-        step: The wanted one, from 0; negative ones count from the last; None: the last.
-
-    Returns:
-        Its index, and what to tell who did not choose.
-
-    Raises:
-        MeshError: There is no such step.
-    """
-    count = len(times)
-    index = count - 1 if step is None else step + count if step < 0 else step
-    if not 0 <= index < count:
-        raise MeshError(
-            f"{path} has no time step {step}; its {counted(count, 'step')} have the numbers 0 to {count - 1}."
-        )
-    if step is not None or count == 1:
-        return index, ()
-    note = (
-        f"Of {count:,} time steps the last was read, number {index} at time {times[index]:g}; --step chooses another."
-    )
-    return index, (note,)
+        arrays = self.cell_data if self.is_per_cell else self.point_data
+        return np.column_stack((arrays["color"], arrays["density"])) if "color" in arrays else None
 
 
 def damaged(path: Path, problem: str) -> MeshError:

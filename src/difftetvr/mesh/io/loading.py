@@ -4,26 +4,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
 
 from difftetvr.errors import MeshError, counted
-from difftetvr.mesh import validation
 from difftetvr.mesh.field import Field, Location
+from difftetvr.mesh.io.building import NO_DEFECTS, Defects, Flat, Request, Tets, build_mesh, with_overlaps
 from difftetvr.mesh.io.content import CellBlock, Content, require_array
 from difftetvr.mesh.io.formats.table import format_of
 from difftetvr.mesh.making.conversion import CONVERTIBLE, is_quadratic, num_nodes, to_tetrahedra
-from difftetvr.mesh.making.repair import repair
 from difftetvr.mesh.tetmesh import TetMesh
 
 FIELD_ARRAYS = ("color", "density")
 HARMONICS = "harmonics"
 """Names of the point or cell data that are a mesh's field."""
-
-Flat = Literal["refuse", "drop", "repair"]
-"""What becomes of cells of exactly zero volume."""
 
 # What commonly lies beside the volume cells in a file and bounds them; it carries no volume.
 _LOWER_DIMENSIONAL = ("vertex", "line", "triangle", "quad", "polygon", "pixel", "empty", "poly_")
@@ -37,11 +32,11 @@ class MeshData:
     Attributes:
         mesh: The mesh of the tetrahedra, without vertices that none of them uses.
         field: Colour and density, where the file has both and they can be rendered; else None.
-        point_data: Arrays of one row for each vertex of the mesh: floating-point ones in the mesh's precision, integers
-            and truth values as int64.
+        point_data: Arrays of one row for each vertex of the mesh: floating-point ones in the precision of the file or
+            of the mesh, whichever is higher, integers and truth values as int64.
         cell_data: Arrays of one row for each cell of the mesh; pieces of a cell have its row.
         warnings: Sentences about what was left out or changed.
-        flat_cells: Number of cells without volume that were left out.
+        defects: What is wrong with the file's cells, as far as they were loaded all the same.
         repair: What repairing the mesh changed, in words; None where nothing was.
     """
 
@@ -50,32 +45,17 @@ class MeshData:
     point_data: dict[str, torch.Tensor]
     cell_data: dict[str, torch.Tensor]
     warnings: tuple[str, ...] = ()
-    flat_cells: int = 0
+    defects: Defects = NO_DEFECTS
     repair: str | None = None
 
-
-@dataclass(frozen=True)
-class _Request:
-    """What is to be loaded, and how; see `load_data`."""
-
-    path: Path
-    dtype: torch.dtype
-    split: bool
-    flat: Flat
-    step: int | None = None
-
-
-@dataclass(frozen=True)
-class _Tets:
-    """Tetrahedra (T, 4) int64, the rows of the file's cell data they belong to (T,), and sentences about them."""
-
-    nodes: np.ndarray
-    rows: np.ndarray
-    notes: tuple[str, ...]
+    @property
+    def flat_cells(self) -> int:
+        """Number of cells without volume that were left out."""
+        return self.defects.flat
 
 
 def load(
-    path: str | Path, dtype: torch.dtype = torch.float32, *, split: bool = False, flat: Flat = "refuse"
+    path: str | Path, dtype: torch.dtype | None = None, *, split: bool = False, flat: Flat = "refuse"
 ) -> tuple[TetMesh, Field]:
     """Reads a tetrahedral mesh with its field; `load_mesh` reads the geometry of a file without one.
 
@@ -85,7 +65,8 @@ def load(
 
     Args:
         path: .vtu, .vtk, .msh, .mesh, .xdmf, .npz, .bintet, .ovm, .node or .ele, or what else meshio reads.
-        dtype: Floating-point type of vertices, colours and densities. Files of this type round-trip to the bit.
+        dtype: Floating-point type of vertices, colours and densities. Files of this type round-trip to the bit. None:
+            float32, or float64 where rounding to that would flatten or invert a cell.
         split: Split hexahedra, wedges and pyramids into tetrahedra, and straighten quadratic cells.
         flat: What becomes of cells of exactly zero volume: "drop" leaves them out, which changes no picture; "repair"
             mends the mesh so that it can be deformed, too (see `difftetvr.mesh.making.repair`); "refuse" makes them an
@@ -101,33 +82,34 @@ def load(
 
 
 def load_with_optional_field(
-    path: str | Path, dtype: torch.dtype = torch.float32, *, split: bool = False, flat: Flat = "refuse"
+    path: str | Path, dtype: torch.dtype | None = None, *, split: bool = False, flat: Flat = "refuse"
 ) -> tuple[TetMesh, Field | None]:
     """Like `load`, but gives None for the field of a file that holds no ``color`` and ``density``."""
-    data, problem = _load(_Request(Path(path), dtype, split, flat))
+    data, problem = _load(Request(Path(path), dtype, split, flat))
     if problem is not None:
         raise problem
     return data.mesh, data.field
 
 
 def load_mesh(
-    path: str | Path, dtype: torch.dtype = torch.float32, *, split: bool = False, flat: Flat = "refuse"
+    path: str | Path, dtype: torch.dtype | None = None, *, split: bool = False, flat: Flat = "refuse"
 ) -> TetMesh:
     """Reads the geometry alone, from any file that `load` reads and from formats without attributes (.mesh).
 
     Raises:
         MeshError: As `load`, except that no data arrays are needed.
     """
-    return _load(_Request(Path(path), dtype, split, flat))[0].mesh
+    return _load(Request(Path(path), dtype, split, flat))[0].mesh
 
 
 def load_data(
     path: str | Path,
-    dtype: torch.dtype = torch.float32,
+    dtype: torch.dtype | None = None,
     *,
     split: bool = False,
     flat: Flat = "refuse",
     step: int | None = None,
+    loose: bool = False,
     require_field: bool = False,
 ) -> MeshData:
     """Reads a mesh with all data of its vertices and cells, such as the scalars of a simulation.
@@ -139,6 +121,9 @@ def load_data(
         flat: As for `load`.
         step: Time step to read of a file that has several, from 0; negative ones count from the last; None: the last,
             with a warning.
+        loose: Take cells that overlap their neighbours, or share a face with two others, as loose ones (see `TetMesh`),
+            which some renderers draw, and leave out copies of cells and those without finite positions; each with a
+            warning.
         require_field: Insist on ``color`` and ``density``, as `load` does. Else arrays of these names that cannot
             be rendered are data like any other, and a warning says so.
 
@@ -148,7 +133,7 @@ def load_data(
     Raises:
         MeshError: As `load`.
     """
-    request = _Request(Path(path), dtype, split, flat, step)
+    request = Request(Path(path), dtype, split, flat, step, loose)
     data, problem = _load(request)
     if require_field:
         if problem is not None:
@@ -165,18 +150,24 @@ def load_data(
     return data
 
 
-def _load(request: _Request) -> tuple[MeshData, MeshError | None]:
+def _load(request: Request) -> tuple[MeshData, MeshError | None]:
     """The mesh with its data, and what keeps ``color`` and ``density`` from being its field where the file has both."""
     content = _read(request.path, request.step)
     tets = _tetrahedra(request, content)
-    built = _build_mesh(request, _floats(content.vertices, request.dtype), tets)
+    built = with_overlaps(build_mesh(request, content.vertices, tets))
     mesh, kept = built.mesh, built.kept
     stored = {"vertex": content.point_data, "cell": content.cell_data}
     data = {
         place: {n: v for n, values in arrays.items() if (v := _tensor(values, kept[place], request.dtype)) is not None}
         for place, arrays in stored.items()
     }
-    found = MeshData(mesh, None, data["vertex"], data["cell"], built.notes, built.flat_cells, built.repair)
+    unused = sorted({*content.point_data, *content.cell_data}.difference(*data.values()))
+    notes = (
+        (*built.notes, f"Left out data that are no numbers, or too few: {', '.join(unused)}.")
+        if unused
+        else built.notes
+    )
+    found = MeshData(mesh, None, data["vertex"], data["cell"], notes, built.defects, built.repair)
     location = next((place for place, arrays in stored.items() if all(n in arrays for n in FIELD_ARRAYS)), None)
     if location is None:
         return found, None
@@ -187,34 +178,6 @@ def _load(request: _Request) -> tuple[MeshData, MeshError | None]:
         return replace(found, field=field), None
     except MeshError as error:
         return found, error
-
-
-@dataclass(frozen=True)
-class _Built:
-    """A mesh, the rows of the file's data that its vertices and cells have, and what was done to it."""
-
-    mesh: TetMesh
-    kept: dict[str, np.ndarray]
-    notes: tuple[str, ...]
-    flat_cells: int = 0
-    repair: str | None = None
-
-
-def _build_mesh(request: _Request, points: torch.Tensor, tets: _Tets) -> _Built:
-    if request.flat == "repair":
-        try:
-            repaired = repair(points, tets.nodes)
-        except MeshError as error:
-            raise MeshError(f"{request.path}: {error}") from error
-        report = str(repaired.report) if repaired.report.changed else None
-        kept = {"vertex": repaired.vertex_origins.numpy(), "cell": tets.rows[repaired.cell_origins.numpy()]}
-        return _Built(repaired.mesh, kept, (*tets.notes, report) if report else tets.notes, 0, report)
-    tets, flat_cells = _without_flat(request, points, tets)
-    try:
-        mesh, used = TetMesh(points, torch.from_numpy(tets.nodes)).without_unused_vertices()
-    except MeshError as error:
-        raise MeshError(f"{request.path}: {error}") from error
-    return _Built(mesh, {"vertex": used.numpy(), "cell": tets.rows}, tets.notes, flat_cells)
 
 
 def _read(path: Path, step: int | None) -> Content:
@@ -231,7 +194,7 @@ def _read(path: Path, step: int | None) -> Content:
     return content
 
 
-def _tetrahedra(request: _Request, content: Content) -> _Tets:
+def _tetrahedra(request: Request, content: Content) -> Tets:
     volumes = [b for b in content.cells if len(b.nodes) and not b.kind.startswith(_LOWER_DIMENSIONAL)]
     if not volumes:
         found = ", ".join(sorted({block.kind for block in content.cells})) or "no cells"
@@ -247,10 +210,10 @@ def _tetrahedra(request: _Request, content: Content) -> _Tets:
         pieces, parents = to_tetrahedra(block.kind, block.nodes.astype(np.int64))
         nodes.append(pieces)
         rows.append(block.rows[parents])
-    return _Tets(np.concatenate(nodes), np.concatenate(rows), tuple(notes))
+    return Tets(np.concatenate(nodes), np.concatenate(rows), tuple(notes))
 
 
-def _require_convertible(request: _Request, block: CellBlock, num_vertices: int) -> None:
+def _require_convertible(request: Request, block: CellBlock, num_vertices: int) -> None:
     path, cells = request.path, f"{counted(len(block.nodes), 'cell')} of type '{block.kind}'"
     if block.kind not in CONVERTIBLE:
         raise MeshError(f"{path} holds {cells}, which cannot be split into tetrahedra; tetrahedralise it first.")
@@ -269,44 +232,14 @@ def _require_convertible(request: _Request, block: CellBlock, num_vertices: int)
         )
 
 
-def _without_flat(request: _Request, points: torch.Tensor, tets: _Tets) -> tuple[_Tets, int]:
-    """The tetrahedra without those of exactly zero volume, and how many these were."""
-    cells = torch.from_numpy(tets.nodes)
-    corners = np.sort(tets.nodes, 1)
-    flat = (corners[:, 1:] == corners[:, :-1]).any(1)
-    proper = np.flatnonzero(~flat)
-    try:
-        validation.check_finite(points, cells)
-        flat[proper] = (validation.orientations(points, cells[proper]) == 0).numpy()
-    except MeshError as error:
-        raise MeshError(f"{request.path}: {error}") from error
-    count = int(flat.sum())
-    if not count:
-        return tets, 0
-    if request.flat == "refuse":
-        first = int(flat.argmax())
-        names = ", ".join(str(v) for v in tets.nodes[first])
-        what = "it repeats a vertex" if len(set(tets.nodes[first])) < 4 else "its vertices lie in one plane"
-        raise MeshError(
-            f"{request.path}: Cell {tets.rows[first]}: its volume is zero, as {what} ({names}), and so it is for "
-            f"{count:,} of {len(flat):,} cells; load with flat='drop' to leave them out."
-        )
-    if count == len(flat):
-        raise MeshError(f"{request.path}: of its {counted(count, 'cell')} none has any volume; give a volume mesh.")
-    note = (
-        f"{count:,} of {len(flat):,} cells {'has' if count == 1 else 'have'} no volume and "
-        f"{'was' if count == 1 else 'were'} left out; {'it does' if count == 1 else 'they do'} not change the picture."
-    )
-    return _Tets(tets.nodes[~flat], tets.rows[~flat], (*tets.notes, note)), count
-
-
-def _tensor(values: np.ndarray, rows: np.ndarray, dtype: torch.dtype) -> torch.Tensor | None:
+def _tensor(values: np.ndarray, rows: np.ndarray, dtype: torch.dtype | None) -> torch.Tensor | None:
     """Rows of a data array; None for one that has fewer, or that holds no numbers."""
     if values.dtype.kind not in "fiub" or values.ndim == 0 or values.size == 0 or len(values) <= rows.max():
         return None
     picked = values[rows]
     if picked.dtype.kind == "f" or (picked.dtype.itemsize == 8 and (picked > _LARGEST_INTEGER).any()):
-        return _floats(picked, dtype)
+        found = _floats(picked)
+        return found.to(dtype) if dtype == torch.float64 else found
     return torch.from_numpy(picked.astype(np.int64))
 
 
@@ -317,7 +250,7 @@ def _picked(path: Path, arrays: dict[str, np.ndarray], name: str, rows: np.ndarr
     return values[rows]
 
 
-def _build_field(request: _Request, mesh: TetMesh, arrays: list[np.ndarray], location: Location) -> Field:
+def _build_field(request: Request, mesh: TetMesh, arrays: list[np.ndarray], location: Location) -> Field:
     count = mesh.num_vertices if location == "vertex" else mesh.num_cells
     color, density, *directional = arrays
     if density.ndim == 2 and density.shape[1] == 1:
@@ -331,15 +264,15 @@ def _build_field(request: _Request, mesh: TetMesh, arrays: list[np.ndarray], loc
                 f"it must be numbers of shape {shape}."
             )
     try:
-        harmonics = _floats(directional[0], request.dtype).reshape(count, -1, 3) if directional else None
-        field = Field(_floats(color, request.dtype), _floats(density, request.dtype), location, harmonics)
+        harmonics = _floats(directional[0]).reshape(count, -1, 3) if directional else None
+        field = Field(_floats(color), _floats(density), location, harmonics).to(dtype=mesh.vertices.dtype)
         field.validate(mesh)
     except MeshError as error:
         raise MeshError(f"{request.path}: {error}") from error
     return field
 
 
-def _floats(values: np.ndarray, dtype: torch.dtype) -> torch.Tensor:
-    """Stored numbers in a floating-point type; integers up to 2^53 pass through exactly."""
+def _floats(values: np.ndarray) -> torch.Tensor:
+    """Stored numbers in the floating-point type that holds them; integers up to 2^53 pass through exactly."""
     native = np.float32 if values.dtype.kind == "f" and values.dtype.itemsize <= 4 else np.float64
-    return torch.from_numpy(np.array(values, dtype=native)).to(dtype)
+    return torch.from_numpy(np.array(values, dtype=native))

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from difftetvr.rendering.traversal.rays import CameraRays
 
 _ORTHONORMALITY_TOLERANCE = 1e-3
+_FAR = 16.0  # distances of camera and target from the origin, in their distance from each other
 _MOST_PIXELS = 1 << 28  # four floats a pixel stay within the kernels' 32-bit indices
 
 Vector = Sequence[float] | torch.Tensor
@@ -99,6 +100,10 @@ class Camera:
             width: Image width in pixels.
             height: Image height in pixels.
 
+        Returns:
+            The camera; its extrinsics are float64 if it is so far from the origin that float32 would not tell where it
+            is, and else float32.
+
         Raises:
             CameraError: The points coincide, ``up`` is parallel to the view, or a value is out of range.
         """
@@ -119,8 +124,10 @@ class Camera:
         pose = torch.eye(4, dtype=torch.float64)
         pose[:3, :3] = rotation
         pose[:3, 3] = -rotation @ origin
+        if float(torch.maximum(origin.abs(), center.abs()).max()) < _FAR * float((center - origin).norm()):
+            pose = pose.to(torch.float32)
         focal = 0.5 * height / math.tan(0.5 * fov_y)
-        return Camera(pose.to(torch.float32), focal, focal, 0.5 * width, 0.5 * height, width, height)
+        return Camera(pose, focal, focal, 0.5 * width, 0.5 * height, width, height)
 
     @property
     def position(self) -> torch.Tensor:
@@ -160,6 +167,19 @@ class Camera:
         return replace(
             self, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy, width=width, height=height
         )
+
+    def relative_to(self, origin: Sequence[float]) -> Camera:
+        """The same view of a world whose origin lies at a point of this one; differentiable in the extrinsics.
+
+        Args:
+            origin: (3,) that point, in world space.
+        """
+        if not any(origin):
+            return self
+        pose = self.world_to_camera.double()
+        shift = torch.tensor([*origin, 0.0], dtype=torch.float64, device=pose.device)
+        moved = torch.cat((pose[:, :3], (pose[:, 3] + pose @ shift)[:, None]), dim=1)
+        return self.with_pose(moved)
 
     def with_pose(self, world_to_camera: torch.Tensor) -> Camera:
         """The same intrinsics with other extrinsics."""

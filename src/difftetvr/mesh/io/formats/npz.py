@@ -66,8 +66,15 @@ def write(path: Path, output: Output) -> None:
         path: The file to write.
         output: The mesh, and the field's arrays.
     """
-    arrays: dict[str, Any] = {"vertices": output.vertices, "tets": output.tets, **output.arrays}
-    if output.arrays:
+    arrays: dict[str, Any] = {"vertices": output.vertices, "tets": output.tets, **output.point_data, **output.cell_data}
+    if len(arrays) < 2 + len(output.point_data) + len(output.cell_data):
+        raise MeshError(f"{output.path}: in this format all data need names of their own; rename some, or use .vtu.")
+    if output.cell_data and len(output.vertices) == len(output.tets) and not output.is_per_cell:
+        raise MeshError(
+            f"{output.path}: this format cannot tell data of cells from those of vertices where there are as many of "
+            "both; use .vtu."
+        )
+    if output.rgba is not None:
         arrays["location"] = np.array("cell" if output.is_per_cell else "vertex")
     with open(path, "wb") as file:
         np.savez_compressed(file, **arrays)

@@ -20,6 +20,7 @@ class Format:
         read: From a file to its content; where the format has time steps, from a file and the step to read, too.
         write: From a mesh to a file; None for formats that are only read.
         holds_field: Whether it holds colour and density beside the geometry.
+        holds_data: Whether it holds any other data of vertices and cells by their names.
         holds_harmonics: Whether it holds what colours owe to the direction, too.
         is_single: Whether it holds float32 only.
         has_steps: Whether a file may hold several time steps; see `difftetvr.mesh.io.content.chosen_step`.
@@ -28,6 +29,7 @@ class Format:
     read: Callable[..., Content]
     write: Callable[[Path, Output], None] | None = None
     holds_field: bool = True
+    holds_data: bool = False
     holds_harmonics: bool = False
     is_single: bool = False
     has_steps: bool = False
@@ -60,12 +62,12 @@ def _write_xdmf(path: Path, output: Output) -> None:
 
 
 FORMATS: dict[str, Format] = {
-    ".vtu": Format(through_meshio.read_vtu, through_meshio.write, holds_harmonics=True),
-    ".vtk": Format(vtk.read, through_meshio.write),
-    ".msh": Format(gmsh.read, through_meshio.write),
-    ".xdmf": Format(through_meshio.read_xdmf, _write_xdmf),
+    ".vtu": Format(through_meshio.read_vtu, through_meshio.write, holds_data=True, holds_harmonics=True),
+    ".vtk": Format(vtk.read, through_meshio.write, holds_data=True),
+    ".msh": Format(gmsh.read, through_meshio.write, holds_data=True),
+    ".xdmf": Format(through_meshio.read_xdmf, _write_xdmf, holds_data=True),
     ".xmf": Format(through_meshio.read_xdmf),
-    ".npz": Format(npz.read, npz.write, holds_harmonics=True),
+    ".npz": Format(npz.read, npz.write, holds_data=True, holds_harmonics=True),
     ".bintet": Format(bintet.read, bintet.write, is_single=True),
     ".ovm": Format(ovm.read, ovm.write),
     ".node": Format(tetgen.read, tetgen.write),
