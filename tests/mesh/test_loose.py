@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from difftetvr.errors import MeshError
-from difftetvr.mesh import TetMesh, Topology, bisect_edges, remove_cells, star_subdivision
+from difftetvr.mesh import TetMesh, Topology, bisect_edges, star_subdivision
 from difftetvr.mesh.topology.incidence import boundary_vertices, cell_edges, cell_faces
 
 LOOSE = "This mesh is made of loose cells"
@@ -80,7 +80,6 @@ def test_cells_are_oriented_and_measured_one_by_one():
         lambda mesh: mesh.topology.boundary_cells,
         lambda mesh: cell_faces(mesh.topology),
         lambda mesh: boundary_vertices(mesh.topology),
-        lambda mesh: remove_cells(mesh, torch.zeros(mesh.num_cells, dtype=torch.bool)),
     ],
 )
 def test_whoever_asks_for_neighbours_is_told_every_time(ask):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar
@@ -13,10 +14,11 @@ from difftetvr.cli.arguments import Groups
 from difftetvr.cli.options import CAPTURE_GROUPS, CaptureOptions, Color, MeshOptions, TrustOptions, color_of, load_model
 from difftetvr.errors import FitError, MeshError, counted
 from difftetvr.files import require_writable
-from difftetvr.fitting.records.folder import write_json
+from difftetvr.fitting.records.folder import RunFolder, write_json
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.table import Table
 
 
 @dataclass(frozen=True)
@@ -82,12 +84,14 @@ class Info:
         from difftetvr.mesh.io import FIELD_ARRAYS, HARMONICS
 
         data = self.reading.load(path, console)
-        for table in mesh_tables(self.file, data.mesh, data.field, data.flat_cells):
+        for table in mesh_tables(self.file, data.mesh, data.field, data.defects):
             console.print(table)
         shown = (*FIELD_ARRAYS, HARMONICS) if data.field is not None else ()
         others = [{n: v for n, v in d.items() if n not in shown} for d in (data.point_data, data.cell_data)]
         if (table_of_data := data_table(*others)) is not None:
             console.print(table_of_data)
+        if (table_of_run := _run_of(path)) is not None:
+            console.print(table_of_run)
 
 
 @dataclass(frozen=True)
@@ -130,6 +134,20 @@ class Export:
         content = ", ".join(written) or "geometry only"
         without = f", without {', '.join(left_out)}" if left_out else ""
         console.print(f"Wrote {self.output} ({counted(data.mesh.num_cells, 'cell')}, {content}{without})")
+
+
+def _run_of(path: Path) -> Table | None:
+    """What is known of the run that a model is the result of; None where it lies beside none."""
+    from difftetvr.view.describe import run_table
+
+    folder = RunFolder(path.parent)
+    if path.name != folder.model.name or not (folder.config.is_file() and folder.metrics.is_file()):
+        return None
+    try:
+        config, metrics = (json.loads(file.read_text(encoding="utf-8")) for file in (folder.config, folder.metrics))
+    except (OSError, ValueError, RecursionError):
+        return None
+    return run_table("run", config, metrics) if isinstance(config, dict) and isinstance(metrics, dict) else None
 
 
 def _is_capture(path: Path) -> bool:

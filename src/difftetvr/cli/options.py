@@ -160,7 +160,7 @@ class MeshOptions:
         """
         from difftetvr.mesh.io import load_data
 
-        data = load_data(path, split=self.split, flat="drop", step=self.step, require_field=require_field)
+        data = load_data(path, split=self.split, flat="drop", step=self.step, loose=True, require_field=require_field)
         if console is not None:
             for warning in data.warnings:
                 console.print(warning)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from difftetvr.mesh import Field, TetMesh
-    from difftetvr.mesh.io import MeshData
+    from difftetvr.mesh.io import Defects, MeshData
     from difftetvr.rendering import Camera, ScalarField
 
 # Where the default camera stands, seen from the mesh: in front, to the right, a little above.
@@ -33,7 +33,8 @@ class ScalarOptions:
     """What scalars of a simulation look like, for meshes without color and density, or where a scalar is named."""
 
     scalar: str | None = None
-    """Name of the point or cell data to show; default: color and density, or the only data there are."""
+    """Name of the point or cell data to show, with a component if wanted (velocity:x, stress:von-mises); default: color
+    and density, or the only data there are."""
     transfer_function: Path | None = None
     """Colour and opacity of the scalar, .json or .xml; default: blue over white to red, the more opaque the greater."""
     value_range: tuple[float, float] | None = None
@@ -41,22 +42,30 @@ class ScalarOptions:
     attenuation: float = 25.0
     """Density of opacity 1, where the mesh's longest side is 1."""
 
-    def apply(self, data: MeshData, path: Path) -> tuple[Field | ScalarField, str | None]:
-        """What to render of a file, and the name of the scalar, if it is one."""
+    def apply(self, data: MeshData, path: Path) -> Shown:
+        """What to render of a file.
+
+        Raises:
+            MeshError: There is no such scalar, it is the same everywhere, or an option is out of range.
+        """
         if self.scalar is None and data.field is not None:
-            return data.field, None
+            return Shown(data.mesh, data.field)
         import torch
 
+        from difftetvr.mesh.io import missing_note, scalar_of
         from difftetvr.optics.transfer_function import TransferFunction
         from difftetvr.rendering import ScalarField
 
         if not (math.isfinite(self.attenuation) and self.attenuation >= 0):
             raise MeshError(f"--attenuation is {self.attenuation:g}; it must be finite and not negative.")
-        name, values, location = self._find(data, path)
-        low, high = (float(v) for v in torch.aminmax(values))
+        try:
+            scalar = scalar_of(data, self.scalar)
+        except MeshError as error:
+            raise MeshError(f"{path}: {error}") from error
+        low, high = (float(v) for v in torch.aminmax(scalar.values))
         if low == high and self.value_range is None:
             raise MeshError(
-                f"The scalar '{name}' of {path} is {low:g} everywhere; name another, or give --value-range."
+                f"The scalar '{scalar.name}' of {path} is {low:g} everywhere; name another, or give --value-range."
             )
         if self.transfer_function is None:
             function = TransferFunction.default()
@@ -64,25 +73,18 @@ class ScalarOptions:
             function = TransferFunction.load(self.transfer_function)
         lower, upper = data.mesh.bounds()
         density = self.attenuation / float((upper - lower).max())
-        return ScalarField(values, function, density, self.value_range, location), name
+        field = ScalarField(scalar.values, function, density, self.value_range, scalar.location)
+        return Shown(scalar.mesh, field, scalar.name, missing_note(scalar))
 
-    def _find(self, data: MeshData, path: Path) -> tuple[str, torch.Tensor, Literal["vertex", "cell"]]:
-        arrays = {name: (values, "cell") for name, values in data.cell_data.items()}
-        arrays |= {name: (values, "vertex") for name, values in data.point_data.items()}
-        shown = {name: item for name, item in arrays.items() if item[0].dim() == 1 or item[0].shape[1:] == (3,)}
-        names = ", ".join(sorted(shown)) or "none"
-        if not shown:
-            raise MeshError(f"{path} has no scalars to show; add point or cell data, or color and density.")
-        if self.scalar is None and len(shown) > 1:
-            raise MeshError(f"{path} has several scalars ({names}); choose one with --scalar.")
-        name = next(iter(shown)) if self.scalar is None else self.scalar
-        if name not in shown:
-            raise MeshError(f"{path} has no scalar '{name}' (found: {names}); name one of these with --scalar.")
-        values, location = shown[name]
-        values = values.to(data.mesh.vertices.dtype)
-        if values.dim() == 2:
-            name, values = f"magnitude of {name}", values.norm(dim=1)
-        return name, values, "cell" if location == "cell" else "vertex"
+
+@dataclass(frozen=True)
+class Shown:
+    """What is rendered: a mesh, what it holds, the name of the scalar if that is one, and what to say of it."""
+
+    mesh: TetMesh
+    field: Field | ScalarField
+    name: str | None = None
+    note: str | None = None
 
 
 @dataclass(frozen=True)
@@ -111,8 +113,8 @@ class Render:
     """A B C D: show only what lies in the half-space A x + B y + C z + D >= 0."""
     show: Literal["image", "depth-complexity", "cell-quality"] = "image"
     """The image; or how many cells each ray crosses; or the worst quality among them, from 0 (flat) to 1 (regular)."""
-    renderer: Literal["marching", "linked-list", "projected"] = "marching"
-    """How the cells along a ray are found and ordered."""
+    renderer: Literal["marching", "linked-list", "projected"] | None = None
+    """How the cells along a ray are found and ordered; default: marching, or linked-list where cells overlap."""
     device: str | None = None
     """Where to render, such as cpu or cuda; default: the best that works."""
     scalars: OmitArgPrefixes[ScalarOptions] = field(default_factory=ScalarOptions)
@@ -137,41 +139,42 @@ class Render:
         color_of(self.background)
         data = self.mesh.load(self.model, console)
         device = resolve_device(self.device)
-        mesh = data.mesh.to(device=device)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", OrderWarning)
             if self.show == "image":
-                self._draw_image(data, mesh, console)
+                self._draw_image(self.scalars.apply(data, self.model), data.defects, device, console)
             else:
-                self._draw_statistics(mesh, console)
+                self._draw_statistics(data.mesh.to(device=device), data.defects, console)
         for warning in caught:
             console.print(str(warning.message), highlight=False)
 
-    def _draw_image(self, data: MeshData, mesh: TetMesh, console: Console) -> None:
+    def _draw_image(self, shown: Shown, defects: Defects, device: torch.device, console: Console) -> None:
         import torch
 
         from difftetvr.rendering import render
         from difftetvr.view.pictures import save_png
 
-        content, name = self.scalars.apply(data, self.model)
+        if shown.note is not None:
+            console.print(shown.note)
+        mesh = shown.mesh.to(device=device)
         with torch.no_grad():
             image = render(
                 mesh,
-                content.to(device=mesh.vertices.device),
+                shown.field.to(device=device),
                 self._camera(mesh),
                 background=torch.tensor(color_of(self.background)),
-                renderer=self.renderer,
+                renderer=self._renderer_for(mesh, defects),
                 clip_plane=self.clip,
             )
         save_png(self.output, image.color)
-        what = "" if name is None else f", {name}"
+        what = "" if shown.name is None else f", {shown.name}"
         console.print(f"Wrote {self.output} ({self.width} x {self.height}{what})", highlight=False)
 
-    def _draw_statistics(self, mesh: TetMesh, console: Console) -> None:
+    def _draw_statistics(self, mesh: TetMesh, defects: Defects, console: Console) -> None:
         from difftetvr.rendering.inspection import inspect_rays
         from difftetvr.view.heatmap import Scale, save_heatmap
 
-        statistics = inspect_rays(mesh, self._camera(mesh), self.renderer, self.clip)
+        statistics = inspect_rays(mesh, self._camera(mesh), self._renderer_for(mesh, defects), self.clip)
         if self.show == "depth-complexity":
             values = statistics.depth_complexity.float()
             most, mean = int(values.max()), float(values.mean())
@@ -183,6 +186,11 @@ class Render:
             seen = values[~values.isnan()]
             found = f"worst quality seen {float(seen.min()):.3g}" if seen.numel() else "no cell in sight"
         console.print(f"Wrote {self.output} ({found})", highlight=False)
+
+    def _renderer_for(self, mesh: TetMesh, defects: Defects) -> str:
+        # From cell to cell, marching would leave what another cell fills as well.
+        overlaps = not mesh.is_conforming or defects.doubled_places > 0
+        return self.renderer or ("linked-list" if overlaps else "marching")
 
     def _require_valid_camera(self) -> None:
         if not 0.0 < self.fov < 180.0:

@@ -36,7 +36,10 @@ def origin_for(vertices: torch.Tensor) -> Origin:
     if not 0.0 < _FARTHEST * longest < farthest < math.inf:
         return WORLD
     step = 2.0 ** math.ceil(math.log2(longest))
-    x, y, z = (step * round(float(middle) / step) for middle in (0.5 * (low + high)).tolist())
+    # Along an axis where the mesh is near to the origin, shifting it would cost the digits of its smallest numbers.
+    is_far = torch.maximum(low, -high) >= 2.0 * longest
+    middles = torch.where(is_far, 0.5 * (low + high), 0.0).tolist()
+    x, y, z = (step * round(middle / step) for middle in middles)
     return (x, y, z)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from rich.console import Console, ConsoleOptions, RenderResult
@@ -13,8 +14,11 @@ from rich.text import Text
 from difftetvr.capture.capture import Capture
 from difftetvr.fitting.records.evaluation import Evaluation
 from difftetvr.mesh.field import Field
+from difftetvr.mesh.frame import WORLD
 from difftetvr.mesh.harmonics import COUNTS
+from difftetvr.mesh.io import Defects
 from difftetvr.mesh.making.delaunay_check import is_convex, is_delaunay
+from difftetvr.mesh.making.overlaps import overlapping_cells
 from difftetvr.mesh.tetmesh import TetMesh
 
 _QUALITY_BINS = 10
@@ -34,27 +38,30 @@ class _Bar:
         return Measurement(self.length, self.length)
 
 
-def mesh_tables(name: str, mesh: TetMesh, field: Field | None, flat_cells: int | None = None) -> list[Table]:
-    """Size, bounds and attributes of a mesh, and the histogram of its cells' quality Q.
+def mesh_tables(name: str, mesh: TetMesh, field: Field | None, defects: Defects | None = None) -> list[Table]:
+    """Size, soundness, bounds and attributes of a mesh, and the histogram of its cells' quality Q.
 
     Args:
         name: Title, such as the file's name.
         mesh: The mesh.
         field: Its colours and densities, if it has any.
-        flat_cells: Number of cells without volume that were left out of it, if known.
+        defects: What was wrong with the cells of its file, if it comes from one.
     """
     lower, upper = mesh.bounds().tolist()
-    boundary = mesh.topology.boundary_faces.shape[0]
     table = _table(name)
     table.add_row("cells", f"{mesh.num_cells:,}")
-    if flat_cells is not None:
-        table.add_row("flat cells", f"{flat_cells:,}, left out" if flat_cells else "none")
-    table.add_row("vertices", f"{mesh.num_vertices:,}")
-    table.add_row("boundary faces", f"{boundary:,}")
-    convex = is_convex(mesh.vertices, mesh.topology)
-    table.add_row("convex", "yes" if convex else "no")
-    table.add_row("Delaunay", "yes" if convex and is_delaunay(mesh.vertices, mesh.topology) else "no")
+    _add_soundness(table, mesh, defects)
+    table.add_row(
+        "vertices", f"{mesh.num_vertices:,}, {'double' if mesh.vertices.dtype == torch.float64 else 'single'} precision"
+    )
+    if mesh.is_conforming:
+        table.add_row("boundary faces", f"{mesh.topology.boundary_faces.shape[0]:,}")
+        convex = is_convex(mesh.vertices, mesh.topology)
+        table.add_row("convex", "yes" if convex else "no")
+        table.add_row("Delaunay", "yes" if convex and is_delaunay(mesh.vertices, mesh.topology) else "no")
     table.add_row("bounds", f"{_point(lower)} to {_point(upper)}")
+    if mesh.origin != WORLD:
+        table.add_row("counted from", f"{_point(list(mesh.origin))}, as it lies far from (0, 0, 0)")
     table.add_row("volume", f"{float(mesh.volumes().double().sum()):.6g}")
     if field is None:
         table.add_row("attributes", "none (geometry only)")
@@ -65,6 +72,24 @@ def mesh_tables(name: str, mesh: TetMesh, field: Field | None, flat_cells: int |
             table.add_row("harmonics", f"bands up to {COUNTS.index(field.harmonics.shape[1])}")
         table.add_row("density", f"per {location}, {_range(field.density)} per unit length")
     return [table, _quality_table(mesh)]
+
+
+def _add_soundness(table: Table, mesh: TetMesh, defects: Defects | None) -> None:
+    """What is wrong with the cells, in rows that say "none" where nothing is."""
+    overlapping = int(overlapping_cells(mesh).sum())
+    table.add_row("overlapping cells", f"{overlapping:,}" if overlapping else "none")
+    if defects is None:
+        return
+    table.add_row("flat cells", f"{defects.flat:,}, left out" if defects.flat else "none")
+    for what, count in (
+        ("repeated cells", defects.repeated),
+        ("cells not finite", defects.not_finite),
+    ):
+        if count:
+            table.add_row(what, f"{count:,}, left out")
+    if not mesh.is_conforming:
+        table.add_row("faces of 3 or more cells", f"{defects.crowded_faces:,}")
+        table.add_row("faces with both cells on one side", f"{defects.folded_faces:,}")
 
 
 def data_table(point_data: dict[str, torch.Tensor], cell_data: dict[str, torch.Tensor]) -> Table | None:
@@ -86,6 +111,24 @@ def data_table(point_data: dict[str, torch.Tensor], cell_data: dict[str, torch.T
         for name, values in arrays.items():
             shape = " x ".join(str(n) for n in values.shape[1:]) or "1"
             table.add_row(Text(name), place, shape, _finite_range(values))
+    return table
+
+
+def run_table(name: str, config: dict[str, Any], metrics: dict[str, Any]) -> Table:
+    """What a model was fitted to, and how well.
+
+    Args:
+        name: Title.
+        config: Options of the run, as its config.json has them.
+        metrics: Numbers of its result, as its metrics.json has them; empty for a run that has not ended.
+    """
+    table = _table(name)
+    rows: list[tuple[str, Any]] = [("capture", config.get("capture"))]
+    rows += [("iterations", metrics.get("iterations")), ("seconds", metrics.get("seconds"))]
+    rows += [("held-out PSNR (dB)", metrics.get("psnr")), ("held-out SSIM", metrics.get("ssim"))]
+    for key, value in rows:
+        if value is not None:
+            table.add_row(key, Text(f"{value:.4g}" if isinstance(value, float) else str(value)))
     return table
 
 

@@ -35,10 +35,25 @@ def remove_cells(mesh: TetMesh, removed: torch.Tensor) -> MeshChange:
     cells = true_indices(~removed)
     if not cells.numel():
         raise MeshError("All cells would be removed; keep at least one.")
-    # Neighbours stay neighbours. The last entry is where index -1, the outside, leads.
-    new_cell = torch.full((mesh.num_cells + 1,), -1, dtype=torch.int32, device=cells.device)
-    new_cell[cells] = torch.arange(cells.shape[0], dtype=torch.int32, device=cells.device)
-    adjacency = new_cell[mesh.topology.cell_adjacency[cells].long()]
-    remaining = Topology(mesh.tets[cells], mesh.num_vertices, adjacency)
-    compact, kept = TetMesh.from_valid(mesh.vertices.detach(), remaining).without_unused_vertices()
+    compact, kept = cells_of(mesh, cells)
     return with_vertices_kept(mesh, kept, compact.topology, cells.int())
+
+
+def cells_of(mesh: TetMesh, cells: torch.Tensor) -> tuple[TetMesh, torch.Tensor]:
+    """Some cells of a mesh, loose ones if its are: what `remove_cells` leaves.
+
+    Args:
+        mesh: The mesh.
+        cells: (N,) int64 cells, ascending.
+
+    Returns:
+        The mesh of these cells, and the vertices that they use, (V',) int64.
+    """
+    adjacency = None
+    if mesh.is_conforming:
+        # Neighbours stay neighbours. The last entry is where index -1, the outside, leads.
+        new_cell = torch.full((mesh.num_cells + 1,), -1, dtype=torch.int32, device=cells.device)
+        new_cell[cells] = torch.arange(cells.shape[0], dtype=torch.int32, device=cells.device)
+        adjacency = new_cell[mesh.topology.cell_adjacency[cells].long()]
+    topology = Topology(mesh.tets[cells], mesh.num_vertices, adjacency, is_conforming=mesh.is_conforming)
+    return TetMesh.from_valid(mesh.vertices.detach(), topology, mesh.origin).without_unused_vertices()

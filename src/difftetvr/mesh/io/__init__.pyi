@@ -3,10 +3,11 @@ from . import formats as formats
 from . import loading as loading
 from . import saving as saving
 from . import source as source
+from .building import Defects as Defects
+from .building import Flat as Flat
 from .formats.npz import is_mesh_archive as is_mesh_archive
 from .loading import FIELD_ARRAYS as FIELD_ARRAYS
 from .loading import HARMONICS as HARMONICS
-from .loading import Flat as Flat
 from .loading import MeshData as MeshData
 from .loading import load as load
 from .loading import load_data as load_data
@@ -18,14 +19,19 @@ from .saving import Storable as Storable
 from .saving import holds_data as holds_data
 from .saving import require_writable_format as require_writable_format
 from .saving import save as save
+from .scalars import Scalar as Scalar
+from .scalars import missing_note as missing_note
+from .scalars import scalar_of as scalar_of
 
 __all__ = [
     "FIELD_ARRAYS",
     "GEOMETRY_SUFFIXES",
     "HARMONICS",
     "WRITABLE_SUFFIXES",
+    "Defects",
     "Flat",
     "MeshData",
+    "Scalar",
     "Storable",
     "holds_data",
     "is_mesh_archive",
@@ -33,6 +39,8 @@ __all__ = [
     "load_data",
     "load_mesh",
     "load_with_optional_field",
+    "missing_note",
     "require_writable_format",
     "save",
+    "scalar_of",
 ]

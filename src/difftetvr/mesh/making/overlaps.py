@@ -6,7 +6,6 @@ neighbours lie on opposite sides of their faces overlap, a cell at its boundary 
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -23,7 +22,10 @@ _INWARDS = 0.02  # of the way from a face to the opposite vertex
 _TOLERANCE = 1e-6  # of a cell's width, up to which cells only touch
 _PARALLEL = 1e-6  # sine of the angle between edges
 _PAIRS_AT_ONCE = 200_000
-_SEARCHES_AT_ONCE = 100_000
+_BOXES_AT_ONCE = 50_000
+
+Boxes = tuple[np.ndarray, np.ndarray]
+"""Low and high corners, (N, 3) each."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,7 @@ def sampled_overlap(mesh: TetMesh, samples: int = _SAMPLES) -> Overlap | None:
     weights = generator.dirichlet((1.0, 1.0, 1.0), len(faces))
     places = (1 - _INWARDS) * (weights[:, :, None] * faces).sum(1) + _INWARDS * positions[tets[owners, local]]
     doubled = np.zeros(len(places), bool)
-    for cells, at in _pairs_with_places(*_boxes(positions, tets), places):
+    for cells, at in _box_pairs(_boxes(positions, tets), (places, places)):
         other = cells != owners[at]
         cells, at = cells[other], at[other]
         doubled[at[_weights(positions[tets[cells]], places[at]).min(1) > _TOLERANCE]] = True
@@ -87,14 +89,14 @@ def overlapping_cells(mesh: TetMesh) -> torch.Tensor:
     for half_faces in (matching.crowded, matching.folded.flatten()):
         outer[(half_faces >> 2).numpy()] = True
     outer = np.flatnonzero(outer)
-    low, high = _boxes(positions, tets)
+    boxes = _boxes(positions, tets)
     found = np.zeros(len(tets), bool)
-    for cells, at in _box_pairs((low, high), (low[outer], high[outer])):
+    for cells, at in _box_pairs(boxes, (boxes[0][outer], boxes[1][outer])):
         others = outer[at]
         proper = cells != others
         for part in np.array_split(np.flatnonzero(proper), max(1, int(proper.sum()) // _PAIRS_AT_ONCE)):
             one, other = cells[part], others[part]
-            both = _intersect(positions[tets[one]], positions[tets[other]])
+            both = _intersect(positions, tets[one], tets[other])
             found[one[both]] = found[other[both]] = True
     return torch.from_numpy(found)
 
@@ -103,7 +105,7 @@ def _arrays(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
     return mesh.vertices.detach().double().cpu().numpy(), mesh.tets.cpu().numpy().astype(np.int64)
 
 
-def _boxes(positions: np.ndarray, tets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _boxes(positions: np.ndarray, tets: np.ndarray) -> Boxes:
     corners = [positions[tets[:, k]] for k in range(4)]
     return np.minimum.reduce(corners), np.maximum.reduce(corners)
 
@@ -117,11 +119,20 @@ def _weights(corners: np.ndarray, places: np.ndarray) -> np.ndarray:
     return volumes / np.where(total == 0, 1.0, total)
 
 
-def _intersect(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """(N,) bool, whether the interiors of two cells (N, 4, 3) meet: no axis separates them."""
-    middle = one.mean(1, keepdims=True)
-    one, other = one - middle, other - middle
-    left = np.flatnonzero(~(_face_separates(one, other) | _face_separates(other, one)))
+def _intersect(positions: np.ndarray, one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """(N,) bool, whether the interiors of two cells (N, 4) meet: no plane separates them.
+
+    It would be that of a face, or lie along an edge of either. Cells that share two vertices are wedges around the edge
+    between them as far as that is concerned: two of their faces separate them if anything does. Such pairs are most.
+    """
+    shared = np.stack([(one == other[:, [k]]).any(1) for k in range(4)]).sum(0)
+    middle = positions[one[:, 0]][:, None]
+    one, other = positions[one] - middle, positions[other] - middle
+    found = ~_face_separates(one, other)
+    rest = np.flatnonzero(found)
+    found[rest] = ~_face_separates(other[rest], one[rest])
+    left = np.flatnonzero(found & (shared < 2))
+    found[left] = False
     for i, j in LOCAL_EDGES:
         for k, m in LOCAL_EDGES:
             first, second = one[left, j] - one[left, i], other[left, m] - other[left, k]
@@ -129,16 +140,20 @@ def _intersect(one: np.ndarray, other: np.ndarray) -> np.ndarray:
             least = _PARALLEL**2 * (first * first).sum(1) * (second * second).sum(1)
             axis[(axis * axis).sum(1) <= least] = 0.0
             left = left[~_separates(axis, one[left], other[left])]
-    found = np.zeros(len(one), bool)
     found[left] = True
     return found
 
 
 def _face_separates(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """(N,) bool, whether the other cell lies beyond a face of the first: a weight of it is positive at no corner."""
-    weights = np.stack([_weights(one, other[:, k]) for k in range(4)], 1)
-    width = np.minimum(1.0, np.ptp(weights, axis=1))
-    return (weights.max(1) <= _TOLERANCE * width).any(1)
+    """(N,) bool, whether the other cell lies beyond a face of the first, to within a part of the width of either."""
+    origin = one[:, 0]
+    a, b, c = (one[:, k] - origin for k in (1, 2, 3))
+    normals = np.stack((np.cross(b, c), np.cross(c, a), np.cross(a, b)), 2)
+    volume = (a * normals[:, :, 0]).sum(1)
+    weights = (other - origin[:, None]) @ normals / volume[:, None, None]
+    beyond = np.concatenate((weights, 1.0 - weights.sum(2, keepdims=True)), 2)
+    width = np.minimum(1.0, np.ptp(beyond, axis=1))
+    return (beyond.max(1) <= _TOLERANCE * width).any(1)
 
 
 def _separates(axis: np.ndarray, one: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -148,49 +163,33 @@ def _separates(axis: np.ndarray, one: np.ndarray, other: np.ndarray) -> np.ndarr
     return (depth <= _TOLERANCE * width) & axis.any(1)
 
 
-def _pairs_with_places(
-    low: np.ndarray, high: np.ndarray, places: np.ndarray
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Pairs of boxes and places in them, (N,) indices of both; the axis along which fewest share a range is swept."""
-    orders = np.argsort(places, axis=0)
-    ranges = [
-        [np.searchsorted(places[orders[:, axis], axis], ends[:, axis]) for ends in (low, high)] for axis in range(3)
-    ]
-    axis = int(np.argmin([(end - begin).sum() for begin, end in ranges]))
-    begin, number = ranges[axis][0], ranges[axis][1] - ranges[axis][0]
-    hit = np.flatnonzero(number)
-    blocks = np.cumsum(number[hit]) // _PAIRS_AT_ONCE
-    for part in np.split(hit, np.flatnonzero(np.diff(blocks)) + 1):
-        count = number[part]
-        left = np.repeat(part, count)
-        right = orders[np.arange(len(left)) - np.repeat(np.cumsum(count) - count - begin[part], count), axis]
-        inside = ((low[left] <= places[right]) & (places[right] <= high[left])).all(1)
-        yield left[inside], right[inside]
+def _box_pairs(many: Boxes, few: Boxes) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Pairs of boxes that overlap or touch, (N,) indices of both: the many go down a tree of the few."""
+    order, levels = _tree(few)
+    for start in range(0, len(many[0]), _BOXES_AT_ONCE):
+        left = np.arange(start, min(start + _BOXES_AT_ONCE, len(many[0])))
+        node = np.zeros(len(left), np.int64)
+        for low, high in levels:
+            meets = ((many[0][left] <= high[node]) & (low[node] <= many[1][left])).all(1)
+            left, node = left[meets], node[meets]
+            if len(low) < len(order):
+                left, node = np.repeat(left, 2), np.repeat(2 * node, 2)
+                node[1::2] += 1
+        yield left, order[node]
 
 
-def _box_pairs(
-    many: tuple[np.ndarray, np.ndarray], few: tuple[np.ndarray, np.ndarray]
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Pairs of boxes that overlap: indices into both, each pair once.
+def _tree(boxes: Boxes) -> tuple[np.ndarray, list[Boxes]]:
+    """Numbers of boxes so that neighbours in space are neighbours, and what bounds 2^k such numbers, the root first.
 
-    Args:
-        many: Low and high corners, (N, 3) each.
-        few: Low and high corners, (M, 3) each.
+    There are a power of two of them; those that stand for no box have no extent and meet nothing.
     """
-    near = np.flatnonzero(((many[0] <= few[1].max(0)) & (many[1] >= few[0].min(0))).all(1))
-    middles, reach = 0.5 * (many[0] + many[1])[near], 0.5 * (many[1] - many[0])[near].max(1)
-    few_middles, few_reach = 0.5 * (few[0] + few[1]), 0.5 * (few[1] - few[0]).max(1)
-    # Boxes of about one size are searched together, so that a few large ones do not make all searches wide.
-    size_class = np.frexp(few_reach)[1]
-    for kind in np.unique(size_class):
-        members = np.flatnonzero(size_class == kind)
-        tree = cKDTree(few_middles[members])
-        radius = (1 + 1e-9) * (reach + few_reach[members].max())
-        for part in np.array_split(np.arange(len(near)), len(near) // _SEARCHES_AT_ONCE + 1):
-            lists = tree.query_ball_point(middles[part], radius[part], p=np.inf)
-            counts = np.fromiter(map(len, lists), np.int64, len(part))
-            left = np.repeat(near[part], counts)
-            right = members[np.fromiter(itertools.chain.from_iterable(lists), np.int64, len(left))]
-            low = np.maximum(many[0][left], few[0][right])
-            meets = (low <= np.minimum(many[1][left], few[1][right])).all(1)
-            yield left[meets], right[meets]
+    count = len(boxes[0])
+    order = cKDTree(0.5 * (boxes[0] + boxes[1]), leafsize=1).indices
+    padding = 2 ** max(count - 1, 0).bit_length() - count
+    low = np.concatenate((boxes[0][order], np.full((padding, 3), np.inf)))
+    high = np.concatenate((boxes[1][order], np.full((padding, 3), -np.inf)))
+    levels = [(low, high)]
+    while len(low) > 1:
+        low, high = np.minimum(low[::2], low[1::2]), np.maximum(high[::2], high[1::2])
+        levels.append((low, high))
+    return np.concatenate((order, np.zeros(padding, order.dtype))), levels[::-1]

@@ -1,0 +1,76 @@
+"""Scalars of a file by name: components, invariants, places, and cells that have no value."""
+
+import pytest
+import torch
+
+import difftetvr as dtv
+from difftetvr.mesh.io import MeshData, scalar_of
+
+MESH = dtv.TetMesh.grid((2, 2, 2))
+POINTS, CELLS = MESH.num_vertices, MESH.num_cells
+
+
+def data_of(point=None, cell=None):
+    return MeshData(MESH, None, point or {}, cell or {})
+
+
+def test_components_and_invariants():
+    velocity = torch.rand(POINTS, 3)
+    stress = torch.rand(CELLS, 3, 3, dtype=torch.float64)
+    symmetric = 0.5 * (stress + stress.transpose(1, 2))
+    six = torch.stack([symmetric[:, i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))], 1)
+    data = data_of({"v": velocity}, {"s6": six, "s9": stress.flatten(1), "s": stress, "n": torch.arange(CELLS)})
+    for name, expected in (
+        ("v", velocity.norm(dim=1)),
+        ("v:magnitude", velocity.norm(dim=1)),
+        ("v:1", velocity[:, 1]),
+        ("v:z", velocity[:, 2]),
+        ("point:v:x", velocity[:, 0]),
+        ("s:xy", stress[:, 0, 1]),
+        ("s9:7", stress[:, 2, 1]),
+        ("s6:yz", symmetric[:, 1, 2]),
+        ("s6:magnitude", symmetric.flatten(1).norm(dim=1)),
+        ("s9:trace", stress.diagonal(dim1=1, dim2=2).sum(1)),
+        ("n", torch.arange(CELLS, dtype=torch.float64)),
+    ):
+        assert torch.allclose(scalar_of(data, name).values, expected), name
+    deviator = symmetric - symmetric.diagonal(dim1=1, dim2=2).mean(1)[:, None, None] * torch.eye(3)
+    mises = (1.5 * deviator.square().sum((1, 2))).sqrt()
+    for name in ("s6:von-mises", "s9:von-mises", "s:von-mises"):
+        found = scalar_of(data, name)
+        assert torch.allclose(found.values, mises) and found.location == "cell" and "von-mises" in found.name
+    for name, message in (
+        ("v:3", r"no component '3'; its components are 0 to 2, x, y, z, magnitude"),
+        ("v:von-mises", "no component"),
+        ("n:1", "no component"),
+        ("w", r"there is no scalar 'w' \(found: n, s, s6, s9, v\)"),
+        (None, "several scalars"),
+    ):
+        with pytest.raises(dtv.MeshError, match=message):
+            scalar_of(data, name)
+
+
+def test_data_of_points_and_cells_with_one_name_are_told_apart():
+    data = data_of({"p": torch.zeros(POINTS), "a:b": torch.ones(POINTS)}, {"p": torch.ones(CELLS)})
+    assert scalar_of(data, "point:p").location == "vertex" and scalar_of(data, "cell:p").location == "cell"
+    assert scalar_of(data, "a:b").values.sum() == POINTS
+    with pytest.raises(dtv.MeshError, match="both its points and its cells have data 'p'"):
+        scalar_of(data, "p")
+    with pytest.raises(dtv.MeshError, match=r"several scalars \(a:b, cell:p, point:p\)"):
+        scalar_of(data)
+
+
+def test_cells_without_a_value_are_taken_out():
+    values = MESH.vertices[:, 0].clone()
+    values[5], values[9] = torch.nan, torch.inf
+    found = scalar_of(data_of({"p": values}))
+    lost = ((MESH.tets == 5) | (MESH.tets == 9)).any(1)
+    assert found.missing == int(lost.sum()) > 0 and found.mesh.num_cells == CELLS - found.missing
+    assert torch.equal(found.values, found.mesh.vertices[:, 0])
+    found.mesh.topology.cell_adjacency  # noqa: B018  must be that of a valid mesh
+    per_cell = torch.arange(CELLS).double()
+    per_cell[3] = -torch.inf
+    found = scalar_of(data_of(cell={"p": per_cell}))
+    assert found.missing == 1 and 3.0 not in found.values.tolist()
+    with pytest.raises(dtv.MeshError, match="finite in no cell"):
+        scalar_of(data_of({"p": torch.full((POINTS,), torch.nan)}))
