@@ -124,7 +124,8 @@ class Camera:
         pose = torch.eye(4, dtype=torch.float64)
         pose[:3, :3] = rotation
         pose[:3, 3] = -rotation @ origin
-        if float(torch.maximum(origin.abs(), center.abs()).max()) < _FAR * float((center - origin).norm()):
+        ends = torch.stack((origin, center)).detach()
+        if float(ends.abs().max()) < _FAR * float((ends[1] - ends[0]).norm()):
             pose = pose.to(torch.float32)
         focal = 0.5 * height / math.tan(0.5 * fov_y)
         return Camera(pose, focal, focal, 0.5 * width, 0.5 * height, width, height)
