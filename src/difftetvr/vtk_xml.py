@@ -233,7 +233,7 @@ class _Builder(ElementTree.TreeBuilder):
         super().__init__()
         self._error, self._path, self._elements = error, path, 0
 
-    def start(self, tag: str, attrs: dict[str, str], /) -> Element:  # type: ignore[override]
+    def start(self, tag: str, attrs: dict[str, str], /) -> Element:
         self._elements += 1
         if self._elements > _MOST_ELEMENTS:
             raise self._error(f"{self._path} has more than {_MOST_ELEMENTS:,} XML elements; split it up.")
