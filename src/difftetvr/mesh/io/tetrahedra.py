@@ -11,7 +11,7 @@ import numpy as np
 from difftetvr.errors import MeshError, counted
 from difftetvr.mesh.io.building import Request, Tets
 from difftetvr.mesh.io.content import CellBlock, Content, require_array
-from difftetvr.mesh.making.conversion import PIECES, is_convertible, is_curved, num_nodes, to_tetrahedra
+from difftetvr.mesh.making.conversion import PIECES, is_convertible, is_curved, linear_kind, num_nodes, to_tetrahedra
 
 # What commonly lies beside the volume cells in a file and bounds them; it carries no volume.
 _LOWER_DIMENSIONAL = ("vertex", "line", "triangle", "quad", "polygon", "pixel", "empty", "poly_")
@@ -44,18 +44,34 @@ def tetrahedra_of(request: Request, content: Content) -> Tets:
         rows.append(block.rows[parents])
     curved = {kind: count for kind, count in counts.items() if is_curved(kind)}
     notes = [f"Straightened {_listed(curved)}; what nodes other than corners hold was left out."] if curved else []
-    divided = {kind: count for kind, count in counts.items() if kind.rstrip("0123456789") != "tetra"}
-    if divided and split is None:
-        made = sum(len(part) for block, part in zip(volumes, nodes, strict=True) if block.kind in divided)
-        notes.append(f"Split {_listed(divided)} into {made:,} tetrahedra.")
+    if split is None and (divided := _named(counts)):
+        made = sum(len(part) for block, part in zip(volumes, nodes, strict=True) if linear_kind(block.kind) != "tetra")
+        notes.append(f"Split {divided} into {made:,} tetrahedra.")
     return Tets(np.concatenate(nodes), np.concatenate(rows), (*content.notes, *notes))
 
 
 def _listed(counts: Mapping[str, int]) -> str:
     """Cells of several kinds, in words: 8 cells of type 'hexahedron' and 2 of type 'wedge'."""
     (kind, count), *others = sorted(counts.items())
-    words = [f"{counted(count, 'cell')} of type '{kind}'", *(f"{n:,} of type '{other}'" for other, n in others)]
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
+    return _joined([f"{counted(count, 'cell')} of type '{kind}'", *(f"{n:,} of type '{name}'" for name, n in others)])
+
+
+def _named(counts: Mapping[str, int]) -> str:
+    """Cells other than tetrahedra, in words and whatever their order: 8 hexahedra and 2 wedges."""
+    sums: Counter[str] = Counter()
+    for kind, count in counts.items():
+        sums[linear_kind(kind)] += count
+    return _joined(
+        [
+            counted(count, kind, kind.removesuffix("on") + "a" if kind.endswith("hedron") else None)
+            for kind, count in sorted(sums.items())
+            if kind != "tetra"
+        ]
+    )
+
+
+def _joined(words: list[str]) -> str:
+    return f"{', '.join(words[:-1])} and {words[-1]}" if len(words) > 1 else "".join(words)
 
 
 def _require_convertible(path: Path, counts: Mapping[str, int], split: bool | None) -> None:

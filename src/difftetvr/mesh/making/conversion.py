@@ -32,19 +32,24 @@ _CORNERS = {kind: 1 + max(map(max, faces)) for kind, faces in FACES.items()} | {
 
 def is_convertible(kind: str) -> bool:
     """Whether :func:`to_tetrahedra` takes cells of a kind."""
-    linear = _linear(kind)
+    linear = linear_kind(kind)
     return kind in _CORNERS or (linear in FACES and num_nodes(kind) > _CORNERS[linear])
+
+
+def linear_kind(kind: str) -> str:
+    """The kind of cells with the same corners and no further nodes."""
+    return kind.rstrip("0123456789")
 
 
 def num_nodes(kind: str) -> int:
     """Number of nodes of a cell of a convertible kind."""
-    linear = _linear(kind)
+    linear = linear_kind(kind)
     return int(kind.removeprefix(linear) or _CORNERS[linear])
 
 
 def is_curved(kind: str) -> bool:
     """Whether cells of a kind have nodes besides their corners, which straightening leaves out."""
-    return num_nodes(kind) > _CORNERS[_linear(kind)]
+    return num_nodes(kind) > _CORNERS[linear_kind(kind)]
 
 
 def to_tetrahedra(kind: str, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -61,7 +66,7 @@ def to_tetrahedra(kind: str, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     Returns:
         (T, 4) tetrahedra, of either orientation, and (T,) int64 rows of ``nodes`` that they are pieces of, ascending.
     """
-    linear = _linear(kind)
+    linear = linear_kind(kind)
     corners = nodes[:, : _CORNERS[linear]]
     if _CORNERS[linear] == 4:
         return corners, np.arange(len(corners))
@@ -91,8 +96,3 @@ def fans(faces: np.ndarray) -> list[np.ndarray]:
     first = faces.argmin(1)[:, None]
     rolled = np.take_along_axis(faces, (first + np.arange(count)) % count, 1)
     return [rolled[:, [0, i, i + 1]] for i in range(1, count - 1)]
-
-
-def _linear(kind: str) -> str:
-    """The kind that has the same corners and no further nodes."""
-    return kind.rstrip("0123456789")
