@@ -12,7 +12,7 @@ pytest.importorskip("meshio")
 
 
 def vtk_grid():
-    """A grid of VTK with all kinds of linear volume cells, surfaces, and data of many types; its tetrahedra's number."""
+    """A grid of VTK with all kinds of linear volume cells, surfaces, many types of data; its tetrahedra's number."""
     vtk = pytest.importorskip("vtk")
     from vtk.util.numpy_support import numpy_to_vtk
 
