@@ -257,8 +257,8 @@ class _Source:
         size = self._sizes(1)[0]
         if size > self._left:
             raise self._cut_short()
-        header = self._encoded(width)
-        if self._is_base64 and header.tobytes().endswith(b"="):
+        padding = b"=" * (-width % 3)  # of the size alone
+        if self._is_base64 and self._encoded(width).tobytes().endswith(padding):
             self._take(width)
             return self._take(size)
         return self._take(width + size)[width:]

@@ -12,6 +12,7 @@ from difftetvr.mesh.io import load_data
 CUBE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]], float)
 POINTS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]], float)
 TETS = [[0, 1, 2, 3], [1, 2, 3, 4]]
+LEGACY = "# vtk DataFile Version 3.0\nx\nASCII\nDATASET UNSTRUCTURED_GRID\n"
 
 
 def total(data):
@@ -104,11 +105,11 @@ def tables(cells, are_polyhedra):
     for is_polyhedron in are_polyhedra:
         end += len(next(lists)) if is_polyhedron else 0
         ends.append(end if is_polyhedron else -1)
-    old = data_array("faces", sum(stream(cells), [])) + data_array("faceoffsets", ends)
+    old = data_array("faces", list(itertools.chain.from_iterable(stream(cells)))) + data_array("faceoffsets", ends)
     faces = [face for cell in cells for face in cell]
     counts = iter(len(cell) for cell in cells)
     order = np.random.default_rng(0).permutation(len(faces))  # the table of faces may be in any order
-    new = data_array("face_connectivity", sum((faces[i] for i in order), []))
+    new = data_array("face_connectivity", list(itertools.chain.from_iterable(faces[i] for i in order)))
     new += data_array("face_offsets", np.cumsum([len(faces[i]) for i in order]))
     new += data_array("polyhedron_to_faces", np.argsort(order))
     new += data_array("polyhedron_offsets", np.cumsum([next(counts) if is_one else 0 for is_one in are_polyhedra]))
@@ -127,7 +128,7 @@ def test_polyhedra_among_other_cells(tmp_path):
     legacy = [stream([tet])[0], cells[1], stream([PRISM])[0]]
     text = "".join(f"{len(cell)} {numbers(cell)}\n" for cell in legacy)
     (tmp_path / "a.vtk").write_text(
-        f"# vtk DataFile Version 3.0\nx\nASCII\nDATASET UNSTRUCTURED_GRID\nPOINTS {len(points)} double\n{numbers(points)}\n"
+        f"{LEGACY}POINTS {len(points)} double\n{numbers(points)}\n"
         f"CELLS 3 {sum(len(cell) + 1 for cell in legacy)}\n{text}CELL_TYPES 3\n42\n10\n42\n"
     )
     assert total(load_data(tmp_path / "a.vtk", split=True)) == pytest.approx(1)
@@ -140,7 +141,9 @@ def test_polyhedra_that_are_tetrahedra_need_no_splitting(tmp_path):
     assert data.mesh.num_cells == 2 and data.warnings == ()
 
 
-@pytest.mark.parametrize("damage", ["faces", "faceoffsets", "face_offsets", "polyhedron_to_faces", "polyhedron_offsets"])
+@pytest.mark.parametrize(
+    "damage", ["faces", "faceoffsets", "face_offsets", "polyhedron_to_faces", "polyhedron_offsets"]
+)
 def test_damaged_faces_of_polyhedra(tmp_path, damage):
     rng = np.random.default_rng(1)
     for value in (-5, 0, 1, 3, 7, 100, 2**40):
@@ -170,7 +173,7 @@ def test_hidden_and_duplicate_cells_are_left_out(tmp_path):
     (tmp_path / "a.vtu").write_text(vtu(piece(points, cells, [10] * 6, point_data, cell_data)))
     listed = "".join(f"4 {numbers(cell)}\n" for cell in cells)
     (tmp_path / "a.vtk").write_text(
-        f"# vtk DataFile Version 3.0\nx\nASCII\nDATASET UNSTRUCTURED_GRID\nPOINTS {len(points)} double\n{numbers(points)}\n"
+        f"{LEGACY}POINTS {len(points)} double\n{numbers(points)}\n"
         f"CELLS 6 30\n{listed}CELL_TYPES 6\n10 10 10 10 10 10\nCELL_DATA 6\nFIELD f 2\nc 1 6 int\n0 1 2 3 4 5\n"
         f"vtkGhostType 1 6 unsigned_char\n{numbers(flags)}\nPOINT_DATA 30\nSCALARS vtkGhostType unsigned_char\n"
         f"LOOKUP_TABLE default\n{numbers(points_flags)}\n"

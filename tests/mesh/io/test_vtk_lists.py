@@ -15,7 +15,7 @@ def slabs(count):
     """The unit cubes from 0 to `count` along x, each with its points, tetrahedra, and the points' x."""
     grid = TetMesh.grid((1, 1, 1))
     points, tets = grid.vertices.double().numpy(), grid.tets.tolist()
-    return [(points + [i, 0, 0], tets) for i in range(count)]
+    return [(points + np.array([i, 0, 0]), tets) for i in range(count)]
 
 
 def pieces(count=3, **data):
@@ -69,9 +69,7 @@ def test_time_steps_of_a_list(tmp_path):
     (tmp_path / "a.pvd").write_text(list_of("Collection", entries))
     last = load_data(tmp_path / "a.pvd")
     assert last.point_data["x"].max() == 1
-    assert last.warnings == (
-        "Of 3 time steps the last was read, number 2 at time 10; --step chooses another.",
-    )
+    assert last.warnings == ("Of 3 time steps the last was read, number 2 at time 10; --step chooses another.",)
     for step, slab in ((0, [1]), (1, [2, 3]), (2, [0]), (-1, [0]), (-2, [2, 3])):
         data = load_data(tmp_path / "a.pvd", step=step)
         assert sorted(set(data.cell_data["slab"].tolist())) == slab
@@ -132,7 +130,7 @@ def test_ghosts_give_way_to_the_cells_and_points_they_stand_for(tmp_path):
 def test_a_crack_within_a_piece_stays_open(tmp_path):
     (a, tets), (b, _) = slabs(2)
     both = piece(np.concatenate((a, b)), tets + [[i + 8 for i in t] for t in tets], [10] * 12)
-    c = piece(b + [1, 0, 0], tets, [10] * 6)
+    c = piece(b + np.array([1, 0, 0]), tets, [10] * 6)
     (tmp_path / "a.vtu").write_text(vtu(both, c))
     assert load_data(tmp_path / "a.vtu").mesh.num_vertices == 8 + 8 + 4
 
