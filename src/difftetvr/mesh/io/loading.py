@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from difftetvr.errors import MeshError, counted
+from difftetvr.errors import MeshError
 from difftetvr.mesh.field import Field, Location
 from difftetvr.mesh.io.building import NO_DEFECTS, Defects, Flat, Request, build_mesh, with_overlaps
 from difftetvr.mesh.io.content import Content, require_array
