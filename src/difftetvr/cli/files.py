@@ -50,7 +50,7 @@ class Eval:
         if self.output is not None:
             require_writable(self.output, FitError)
         given = None if self.background is None else color_of(self.background)
-        mesh, field_on_mesh = load_model(self.model, self.device)
+        mesh, field_on_mesh = load_model(self.model, self.device, console=console)
         capture = self.views_of.sized_for(self.capture, self.device, console).load(self.capture, console)
         background = usual_background(capture) if given is None else given
         views = list(range(len(capture.cameras))) if self.all_views else capture.test_indices.tolist()
@@ -115,7 +115,7 @@ class Export:
 
         require_writable_format(self.output, with_field=False)
         require_writable(self.output, MeshError)
-        data = self.reading.load(self.model, console)
+        data = self.reading.load(self.model, console, only_draws=False)
         field_on_mesh = None if self.geometry else data.field
         if field_on_mesh is not None and self.without_harmonics:
             field_on_mesh = dataclasses.replace(field_on_mesh, harmonics=None)

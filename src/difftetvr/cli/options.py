@@ -146,21 +146,26 @@ class MeshOptions:
     """How a mesh file is read."""
 
     split: bool = False
-    """Split hexahedra, wedges and pyramids into tetrahedra, straighten quadratic cells."""
+    """Split hexahedra, wedges, pyramids and polyhedra into tetrahedra, and straighten cells of higher order; what only
+    draws does so anyway."""
     step: int | None = None
     """Time step to read of a file that has several, from 0; negative ones count from the last; default: the last."""
 
-    def load(self, path: Path, console: Console | None = None, *, require_field: bool = False) -> MeshData:
+    def load(
+        self, path: Path, console: Console | None = None, *, require_field: bool = False, only_draws: bool = True
+    ) -> MeshData:
         """Reads a mesh with its data, less its flat cells, which show nothing.
 
         Args:
             path: The mesh file.
             console: Where to say what was left out.
             require_field: Insist on color and density.
+            only_draws: Whether nothing but pictures and numbers comes of it, for which cells are split unasked.
         """
         from difftetvr.mesh.io import load_data
 
-        data = load_data(path, split=self.split, flat="drop", step=self.step, loose=True, require_field=require_field)
+        split = None if only_draws and not self.split else self.split
+        data = load_data(path, split=split, flat="drop", step=self.step, loose=True, require_field=require_field)
         if console is not None:
             for warning in data.warnings:
                 console.print(warning)

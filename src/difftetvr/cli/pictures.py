@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from difftetvr.cli.arguments import Groups
-from difftetvr.cli.options import CAPTURE_GROUPS, CaptureOptions, Color, Output, TrustOptions, color_of, load_model
+from difftetvr.cli.options import (
+    CAPTURE_GROUPS,
+    CaptureOptions,
+    Color,
+    MeshOptions,
+    Output,
+    TrustOptions,
+    color_of,
+    load_model,
+)
 from difftetvr.errors import CaptureError, counted
 from difftetvr.files import require_writable
 
@@ -61,7 +70,10 @@ class Compare:
             count = counted(len(self.models), "model")
             raise CaptureError(f"The picture is to show {count} but {len(self.names)} --names; give one for each.")
         names = self.names or tuple(path.stem for path in self.models)
-        models = [Model(name, *load_model(path, self.device)) for name, path in zip(names, self.models, strict=True)]
+        models = [
+            Model(name, *load_model(path, self.device, console=console))
+            for name, path in zip(names, self.models, strict=True)
+        ]
         capture = self.views_of.sized_for(self.capture, self.device, console).load(self.capture, console)
         plane = None if self.no_cut else Plane(self.normal)
         save_picture(self.output, compare_models(capture, models, self.rows, plane, background))
@@ -89,7 +101,6 @@ class Cut:
 
     def run(self, console: Console) -> None:
         """Draws and writes the picture."""
-        from difftetvr.mesh.io import load
         from difftetvr.view.cut import Plane, cut_picture
         from difftetvr.view.pictures import require_png, save_picture
 
@@ -97,8 +108,9 @@ class Cut:
         require_writable(self.output, CaptureError)
         if not 2 <= self.size <= _MOST_PIXELS:
             raise CaptureError(f"--size is {self.size}; it must lie between 2 and {_MOST_PIXELS}.")
-        mesh, field_on_mesh = load(self.model)
+        data = MeshOptions().load(self.model, console, require_field=True)
+        assert data.field is not None
         plane, background = Plane(self.normal, self.origin), color_of(self.background)
-        picture = cut_picture(mesh, field_on_mesh, plane, self.size, not self.no_cells, background)
+        picture = cut_picture(data.mesh, data.field, plane, self.size, not self.no_cells, background)
         save_picture(self.output, picture)
         console.print(f"Wrote {self.output} ({picture.width} x {picture.height})")

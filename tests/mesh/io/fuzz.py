@@ -76,6 +76,18 @@ BINARY_XDMF = """<Xdmf Version="3.0"><Domain><Grid Name="g">
 """
 
 
+POLYHEDRA = """<VTKFile type="UnstructuredGrid"><UnstructuredGrid><Piece NumberOfPoints="5" NumberOfCells="2">
+<CellData><DataArray type="UInt8" Name="vtkGhostType" format="ascii">0 4</DataArray></CellData>
+<Points><DataArray type="Float64" NumberOfComponents="3" format="ascii">
+0 0 0 1 0 0 0 1 0 0 0 1 1 1 1</DataArray></Points>
+<Cells><DataArray type="Int64" Name="connectivity" format="ascii">0 1 2 3 1 2 3 4</DataArray>
+<DataArray type="Int64" Name="offsets" format="ascii">4 8</DataArray>
+<DataArray type="UInt8" Name="types" format="ascii">42 42</DataArray>
+<DataArray type="Int64" Name="faces" format="ascii">{}</DataArray>
+<DataArray type="Int64" Name="faceoffsets" format="ascii">17 34</DataArray></Cells></Piece></UnstructuredGrid></VTKFile>
+"""
+
+
 def seeds(folder: Path) -> list[Path]:
     """Intact small files of all formats."""
     folder.mkdir(exist_ok=True)
@@ -96,7 +108,28 @@ def seeds(folder: Path) -> list[Path]:
     mesh.tets.numpy().tofile(folder / "binary1.bin")
     files[-2].write_bytes(STRUCTURED)
     np.savez(files[-1], points=mesh.vertices.numpy(), cells=mesh.tets.numpy(), pressure=np.ones(mesh.num_vertices))
-    return files
+    return files + vtk_seeds(folder)
+
+
+def vtk_seeds(folder: Path) -> list[Path]:
+    """Pieces, time steps, images and polyhedra of VTK's XML files."""
+    (folder / "beside0.vtu").write_bytes((folder / "vertex.vtu").read_bytes())
+    faces = "4 3 0 1 2 3 0 1 3 3 1 2 3 3 0 2 3 4 3 1 2 3 3 2 3 4 3 1 2 4 3 1 3 4"
+    piece = '<Piece Source="beside0.vtu"/>'
+    steps = "".join(f'<DataSet timestep="{time}" file="beside0.vtu"/>' for time in (0, 1))
+    values = (
+        '<PointData><DataArray type="Int8" Name="p" format="ascii">0 1 2 3 4 5 6 7 8 9 10 11</DataArray></PointData>'
+    )
+    image = f'<Piece Extent="0 2 0 1 0 1">{values}</Piece>'
+    contents = {
+        "pieces.pvtu": f'<VTKFile type="PUnstructuredGrid"><PUnstructuredGrid>{piece}</PUnstructuredGrid></VTKFile>',
+        "steps.pvd": f'<VTKFile type="Collection"><Collection>{steps}</Collection></VTKFile>',
+        "image.vti": f'<VTKFile type="ImageData"><ImageData Spacing="1 2 3">{image}</ImageData></VTKFile>',
+        "polyhedra.vtu": POLYHEDRA.format(faces),
+    }
+    for name, text in contents.items():
+        (folder / name).write_text(text)
+    return [folder / name for name in contents]
 
 
 _CASES = [
@@ -203,7 +236,7 @@ def one(files: list[Path], seed: int, folder: Path) -> Path:
     for i, file in enumerate(pair):
         content = file.read_bytes()
         target.with_suffix(file.suffix).write_bytes(damage(rng, content) if i == broken else content)
-    for beside in source.parent.glob(f"{source.stem}*.bin"):
+    for beside in (*source.parent.glob(f"{source.stem}*.bin"), source.parent / "beside0.vtu"):
         (folder / beside.name).write_bytes(beside.read_bytes())
     return target
 

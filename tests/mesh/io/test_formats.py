@@ -263,15 +263,3 @@ def test_xdmf_with_binary_files_beside_it_only(tmp_path):
     path.write_text(text.format('<DataItem Dimensions="5 3" Format="HDF">a.h5:/p</DataItem>', tets))
     with pytest.raises(MeshError, match=r"h5py|there is no file"):
         load_mesh(path)
-
-
-def test_vtu_that_meshio_would_misread(tmp_path):
-    save(tmp_path / "a.vtu", *model("vertex", torch.float32))
-    text = (tmp_path / "a.vtu").read_text()
-    start, end = text.index("<Piece"), text.index("</Piece>") + len("</Piece>")
-    (tmp_path / "b.vtu").write_text(text[:end] + text[start:end] + text[end:])
-    with pytest.raises(MeshError, match="2 pieces; merge them"):
-        load(tmp_path / "b.vtu")
-    (tmp_path / "c.vtu").write_text(text.replace("vtkZLibDataCompressor", "vtkLZ4DataCompressor"))
-    with pytest.raises(MeshError, match="compressed with vtkLZ4DataCompressor"):
-        load(tmp_path / "c.vtu")

@@ -20,5 +20,5 @@ def test_damaged_files_give_a_mesh_or_a_sentence():
     environment = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
     done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=60 + COUNT)
     assert done.returncode == 0, done.stdout + done.stderr
-    for suffix in (".bintet", ".mesh", ".msh", ".node", ".npz", ".ovm", ".vtk", ".vtu", ".xdmf"):
+    for suffix in (".bintet", ".mesh", ".msh", ".node", ".npz", ".ovm", ".vtk", ".vtu", ".xdmf", ".pvd", ".vti"):
         assert f"{suffix} sentence" in done.stdout

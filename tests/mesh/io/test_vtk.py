@@ -11,11 +11,8 @@ from difftetvr.mesh.io import load_data
 pytest.importorskip("meshio")
 
 
-def vtk_grid(with_voxel):
-    """A grid of VTK with all kinds of linear volume cells, a triangle, and data of many types; its tetrahedra's number.
-
-    With a hexahedron in place of the voxel where it shall have none.
-    """
+def vtk_grid():
+    """A grid of VTK with all kinds of linear volume cells, surfaces, many types of data; its tetrahedra's number."""
     vtk = pytest.importorskip("vtk")
     from vtk.util.numpy_support import numpy_to_vtk
 
@@ -27,9 +24,10 @@ def vtk_grid(with_voxel):
     cells += [(vtk.VTK_WEDGE, [low[i] for i in (0, 1, 2)] + [high[i] for i in (0, 1, 2)])]
     low, high = cube[3], cube[8]
     voxel = [low[i] for i in (0, 1, 3, 2)] + [high[i] for i in (0, 1, 3, 2)]
-    cells += [(vtk.VTK_VOXEL, voxel) if with_voxel else (vtk.VTK_HEXAHEDRON, low + high)]
+    cells += [(vtk.VTK_VOXEL, voxel)]
     low, high = cube[4], cube[9]
     cells += [(vtk.VTK_PYRAMID, [*low, high[0]]), (vtk.VTK_TETRA, [low[1], low[2], high[0], high[2]])]
+    cells += [(vtk.VTK_TRIANGLE_STRIP, low), (vtk.VTK_POLYGON, high[:3]), (vtk.VTK_POLY_LINE, low[:3])]
     grid = vtk.vtkUnstructuredGrid()
     coordinates = vtk.vtkPoints()
     coordinates.SetData(numpy_to_vtk(points, deep=True))
@@ -44,45 +42,60 @@ def vtk_grid(with_voxel):
         scalars = numpy_to_vtk(np.arange(count, dtype=float), deep=True)
         scalars.SetName("s")
         data.SetScalars(scalars)
+        names = vtk.vtkStringArray()
+        names.SetName("name")
+        for i in range(count):
+            names.InsertNextValue("" if i % 3 else f"name {i} of " + "é" * 40 * i)
+        data.AddArray(names)
+        one = numpy_to_vtk(np.arange(count, dtype=float).reshape(count, 1), deep=True)
+        one.SetName("one")
+        data.AddArray(one)
     return vtk, grid, 6 + 3 + 6 + 2 + 1
 
 
 @pytest.mark.parametrize("binary", [False, True])
 @pytest.mark.parametrize("version", [42, 51])
 def test_legacy_files_that_vtk_writes(tmp_path, version, binary):
-    vtk, grid, tets = vtk_grid(with_voxel=True)
+    vtk, grid, tets = vtk_grid()
     writer = vtk.vtkUnstructuredGridWriter()
     writer.SetFileName(str(tmp_path / "a.vtk"))
     writer.SetInputData(grid)
     writer.SetFileVersion(version)
     (writer.SetFileTypeToBinary if binary else writer.SetFileTypeToASCII)()
     writer.Write()
-    check_vtk_grid(load_data(tmp_path / "a.vtk", split=True), tets)
+    data = load_data(tmp_path / "a.vtk", split=True)
+    check_vtk_grid(data, tets)
+    assert data.warnings == ("Left out data that are no numbers: name.",)
 
 
-@pytest.mark.parametrize("mode", ["Ascii", "Binary", "Appended"])
-@pytest.mark.parametrize("compressor", ["None", "ZLib", "LZMA"])
+@pytest.mark.parametrize("mode", ["Ascii", "Binary", "Appended", "Appended in base64"])
+@pytest.mark.parametrize("compressor", ["None", "ZLib", "LZMA", "LZ4"])
 def test_xml_files_that_vtk_writes(tmp_path, mode, compressor):
-    for with_voxel in (False, True):
-        vtk, grid, tets = vtk_grid(with_voxel)
+    if compressor == "LZ4":
+        pytest.importorskip("lz4")
+    vtk, grid, tets = vtk_grid()
+    for header, order in itertools.product(("UInt32", "UInt64"), ("LittleEndian", "BigEndian")):
         writer = vtk.vtkXMLUnstructuredGridWriter()
         writer.SetFileName(str(tmp_path / "a.vtu"))
         writer.SetInputData(grid)
-        getattr(writer, f"SetDataModeTo{mode}")()
+        getattr(writer, f"SetDataModeTo{mode.split()[0]}")()
         getattr(writer, f"SetCompressorTypeTo{compressor}")()
-        writer.Write()
-        if with_voxel:
-            with pytest.raises(MeshError, match="type 11"):  # which meshio leaves out
-                load_data(tmp_path / "a.vtu", split=True)
-        else:
-            check_vtk_grid(load_data(tmp_path / "a.vtu", split=True), tets)
+        getattr(writer, f"SetHeaderTypeTo{header}")()
+        getattr(writer, f"SetByteOrderTo{order}")()
+        writer.SetEncodeAppendedData(mode.endswith("base64"))
+        writer.SetBlockSize(64)
+        assert writer.Write() == 1
+        data = load_data(tmp_path / "a.vtu", split=True)
+        check_vtk_grid(data, tets)
+        assert data.warnings == ("Left out data that are no numbers: name.",)
 
 
 def check_vtk_grid(data, tets):
     assert data.mesh.num_cells == tets
     assert float(data.mesh.volumes().sum()) == pytest.approx(1 + 0.5 + 1 + 1 / 3 + 1 / 6)
     of_cells = data.cell_data["s"].tolist()
-    assert [of_cells.count(i) for i in range(6)] == [6, 0, 3, 6, 2, 1]
+    assert [of_cells.count(i) for i in range(9)] == [6, 0, 3, 6, 2, 1, 0, 0, 0]
+    assert data.cell_data["one"].tolist() == of_cells
     for dtype in ("f4", "f8", "i1", "u1", "i2", "i4", "u4", "i8"):
         values = data.cell_data[f"{dtype} two"]
         assert values.is_floating_point() == (dtype[0] == "f")

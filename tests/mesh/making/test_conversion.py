@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from difftetvr.mesh import TetMesh
-from difftetvr.mesh.making.conversion import CONVERTIBLE, is_quadratic, num_nodes, to_tetrahedra
+from difftetvr.mesh.making.conversion import FACES, is_convertible, is_curved, num_nodes, to_tetrahedra
 
 HEX_CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])
 WEDGE_CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [0, 1, 1]])
@@ -94,17 +94,20 @@ def test_a_hexahedron_that_stands_for_a_wedge():
         assert float(TetMesh(points, proper).volumes().sum()) == pytest.approx(0.5)
 
 
-def test_quadratic_cells_keep_their_corners():
+def test_cells_of_higher_order_keep_their_corners():
     tets, parents = to_tetrahedra("tetra10", np.arange(20).reshape(2, 10))
     assert tets.tolist() == [[0, 1, 2, 3], [10, 11, 12, 13]] and parents.tolist() == [0, 1]
-    for kind in CONVERTIBLE:
-        nodes = np.arange(num_nodes(kind))[None]
-        linear = kind.rstrip("0123456789")
-        assert np.array_equal(to_tetrahedra(kind, nodes)[0], to_tetrahedra(linear, nodes[:, : num_nodes(linear)])[0])
-        assert is_quadratic(kind) == (kind != linear)
+    for kind in FACES:
+        assert is_convertible(kind) and not is_curved(kind)
+        size = num_nodes(kind)
+        high = f"{kind}{size + 7}"
+        assert is_curved(high) and num_nodes(high) == size + 7
+        nodes = np.arange(size + 7)[None]
+        assert np.array_equal(to_tetrahedra(high, nodes)[0], to_tetrahedra(kind, nodes[:, :size])[0])
+    assert not is_convertible("VTK cell type 41") and not is_convertible("polyhedron8") and not is_convertible("tetra3")
 
 
 def test_no_cells_give_no_tetrahedra():
-    for kind in CONVERTIBLE:
+    for kind in FACES:
         tets, parents = to_tetrahedra(kind, np.empty((0, num_nodes(kind)), np.int64))
         assert tets.shape == (0, 4) and parents.shape == (0,)

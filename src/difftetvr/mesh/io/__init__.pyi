@@ -3,6 +3,7 @@ from . import formats as formats
 from . import loading as loading
 from . import saving as saving
 from . import source as source
+from . import tetrahedra as tetrahedra
 from .building import Defects as Defects
 from .building import Flat as Flat
 from .formats.npz import is_mesh_archive as is_mesh_archive

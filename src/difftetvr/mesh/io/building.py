@@ -26,7 +26,7 @@ class Request:
 
     path: Path
     dtype: torch.dtype | None
-    split: bool
+    split: bool | None
     flat: Flat
     step: int | None = None
     loose: bool = False

@@ -8,20 +8,18 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from difftetvr.errors import MeshError, counted
+from difftetvr.errors import MeshError
 from difftetvr.mesh.field import Field, Location
-from difftetvr.mesh.io.building import NO_DEFECTS, Defects, Flat, Request, Tets, build_mesh, with_overlaps
-from difftetvr.mesh.io.content import CellBlock, Content, require_array
+from difftetvr.mesh.io.building import NO_DEFECTS, Defects, Flat, Request, build_mesh, with_overlaps
+from difftetvr.mesh.io.content import Content, require_array
 from difftetvr.mesh.io.formats.table import format_of
-from difftetvr.mesh.making.conversion import CONVERTIBLE, is_quadratic, num_nodes, to_tetrahedra
+from difftetvr.mesh.io.tetrahedra import tetrahedra_of
 from difftetvr.mesh.tetmesh import TetMesh
 
 FIELD_ARRAYS = ("color", "density")
 HARMONICS = "harmonics"
 """Names of the point or cell data that are a mesh's field."""
 
-# What commonly lies beside the volume cells in a file and bounds them; it carries no volume.
-_LOWER_DIMENSIONAL = ("vertex", "line", "triangle", "quad", "polygon", "pixel", "empty", "poly_")
 _LARGEST_INTEGER = 2**63 - 1
 
 
@@ -64,10 +62,11 @@ def load(
     converted as they are, without scaling.
 
     Args:
-        path: .vtu, .vtk, .msh, .mesh, .xdmf, .npz, .bintet, .ovm, .node or .ele, or what else meshio reads.
+        path: .vtu and the other XML files of VTK, .vtk, .msh, .mesh, .xdmf, .npz, .bintet, .ovm, .node or .ele, or what
+            else meshio reads.
         dtype: Floating-point type of vertices, colours and densities. Files of this type round-trip to the bit. None:
             float32, or float64 where rounding to that would flatten or invert a cell.
-        split: Split hexahedra, wedges and pyramids into tetrahedra, and straighten quadratic cells.
+        split: Split hexahedra, wedges, pyramids and polyhedra into tetrahedra, and straighten cells of higher order.
         flat: What becomes of cells of exactly zero volume: "drop" leaves them out, which changes no picture; "repair"
             mends the mesh so that it can be deformed, too (see `difftetvr.mesh.making.repair`); "refuse" makes them an
             error.
@@ -106,7 +105,7 @@ def load_data(
     path: str | Path,
     dtype: torch.dtype | None = None,
     *,
-    split: bool = False,
+    split: bool | None = False,
     flat: Flat = "refuse",
     step: int | None = None,
     loose: bool = False,
@@ -117,7 +116,7 @@ def load_data(
     Args:
         path: As for `load`.
         dtype: Floating-point type of the mesh, its field and its data.
-        split: As for `load`.
+        split: As for `load`; None: split and straighten, too, and say so in a warning.
         flat: As for `load`.
         step: Time step to read of a file that has several, from 0; negative ones count from the last; None: the last,
             with a warning.
@@ -153,7 +152,7 @@ def load_data(
 def _load(request: Request) -> tuple[MeshData, MeshError | None]:
     """The mesh with its data, and what keeps ``color`` and ``density`` from being its field where the file has both."""
     content = _read(request.path, request.step)
-    tets = _tetrahedra(request, content)
+    tets = tetrahedra_of(request, content)
     built = with_overlaps(build_mesh(request, content.vertices, tets))
     mesh, kept = built.mesh, built.kept
     stored = {"vertex": content.point_data, "cell": content.cell_data}
@@ -191,45 +190,12 @@ def _read(path: Path, step: int | None) -> Content:
         reason = error.strerror or type(error).__name__
         raise MeshError(f"{path} cannot be read ({reason}); check the disk and the file's permissions.") from error
     require_array(path, "vertices", content.vertices, 3)
-    return content
+    return replace(content, point_data=_columns(content.point_data), cell_data=_columns(content.cell_data))
 
 
-def _tetrahedra(request: Request, content: Content) -> Tets:
-    volumes = [b for b in content.cells if len(b.nodes) and not b.kind.startswith(_LOWER_DIMENSIONAL)]
-    if not volumes:
-        found = ", ".join(sorted({block.kind for block in content.cells})) or "no cells"
-        raise MeshError(f"{request.path} holds no tetrahedra (found: {found}); give a tetrahedral volume mesh.")
-    nodes, rows, notes = [], [], list(content.notes)
-    for block in volumes:
-        _require_convertible(request, block, len(content.vertices))
-        if is_quadratic(block.kind):
-            notes.append(
-                f"Straightened {counted(len(block.nodes), 'cell')} of type '{block.kind}'; what nodes other than "
-                "corners hold was left out."
-            )
-        pieces, parents = to_tetrahedra(block.kind, block.nodes.astype(np.int64))
-        nodes.append(pieces)
-        rows.append(block.rows[parents])
-    return Tets(np.concatenate(nodes), np.concatenate(rows), tuple(notes))
-
-
-def _require_convertible(request: Request, block: CellBlock, num_vertices: int) -> None:
-    path, cells = request.path, f"{counted(len(block.nodes), 'cell')} of type '{block.kind}'"
-    if block.kind not in CONVERTIBLE:
-        raise MeshError(f"{path} holds {cells}, which cannot be split into tetrahedra; tetrahedralise it first.")
-    if block.kind != "tetra" and not request.split:
-        raise MeshError(
-            f"{path} holds {cells}; only linear tetrahedra can be rendered, so load with split=True (--split of "
-            "render, info and export) to make tetrahedra of them."
-        )
-    require_array(path, f"cells of type '{block.kind}'", block.nodes, num_nodes(block.kind), "iu")
-    outside = (block.nodes < 0) | (block.nodes >= num_vertices)
-    if outside.any():
-        row, column = np.argwhere(outside)[0]
-        raise MeshError(
-            f"{path}: Cell {block.rows[row]}: its vertex index {block.nodes[row, column]} is out of range; the mesh "
-            f"has {num_vertices} vertices, so indices go from 0 to {num_vertices - 1}."
-        )
+def _columns(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Arrays of which those with one number a row, (N, 1), are (N,): some programs write all scalars so."""
+    return {name: v[:, 0] if v.ndim == 2 and v.shape[1] == 1 else v for name, v in arrays.items()}
 
 
 def _tensor(values: np.ndarray, rows: np.ndarray, dtype: torch.dtype | None) -> torch.Tensor | None:
@@ -253,8 +219,6 @@ def _picked(path: Path, arrays: dict[str, np.ndarray], name: str, rows: np.ndarr
 def _build_field(request: Request, mesh: TetMesh, arrays: list[np.ndarray], location: Location) -> Field:
     count = mesh.num_vertices if location == "vertex" else mesh.num_cells
     color, density, *directional = arrays
-    if density.ndim == 2 and density.shape[1] == 1:
-        density = density[:, 0]
     shapes = [("color", color, (count, 3)), ("density", density, (count,))]
     shapes += [(HARMONICS, values, (count, 3 * (values.size // max(1, 3 * count)))) for values in directional]
     for name, values, shape in shapes:

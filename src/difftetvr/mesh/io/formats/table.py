@@ -9,7 +9,8 @@ from pathlib import Path
 
 from difftetvr.errors import MeshError
 from difftetvr.mesh.io.content import Content, Output
-from difftetvr.mesh.io.formats import bintet, gmsh, medit, npz, ovm, tetgen, through_meshio, vtk
+from difftetvr.mesh.io.formats import bintet, gmsh, medit, npz, ovm, tetgen, through_meshio
+from difftetvr.mesh.io.formats.vtk import legacy, lists
 
 
 @dataclass(frozen=True)
@@ -61,9 +62,15 @@ def _write_xdmf(path: Path, output: Output) -> None:
     importlib.import_module("difftetvr.mesh.io.formats.xdmf").write(path, output)
 
 
+_VTK_XML = (
+    *(".pvtu", ".vts", ".pvts", ".vtr", ".pvtr", ".vti", ".pvti", ".vtp", ".pvtp"),
+    *(".vtm", ".vtmb", ".vtpd", ".vtpc", ".pvd"),
+)
+
+
 FORMATS: dict[str, Format] = {
-    ".vtu": Format(through_meshio.read_vtu, through_meshio.write, holds_data=True, holds_harmonics=True),
-    ".vtk": Format(vtk.read, through_meshio.write, holds_data=True),
+    ".vtu": Format(lists.read, through_meshio.write, holds_data=True, holds_harmonics=True, has_steps=True),
+    ".vtk": Format(legacy.read, through_meshio.write, holds_data=True),
     ".msh": Format(gmsh.read, through_meshio.write, holds_data=True),
     ".xdmf": Format(through_meshio.read_xdmf, _write_xdmf, holds_data=True),
     ".xmf": Format(through_meshio.read_xdmf),
@@ -73,5 +80,6 @@ FORMATS: dict[str, Format] = {
     ".node": Format(tetgen.read, tetgen.write),
     ".ele": Format(tetgen.read, tetgen.write),
     ".mesh": Format(medit.read, through_meshio.write, holds_field=False),
+    **dict.fromkeys(_VTK_XML, Format(lists.read, has_steps=True)),
 }
 """Formats by suffix; those that are written are offered in this order."""

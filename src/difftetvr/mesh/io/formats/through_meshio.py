@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import re
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -23,10 +22,6 @@ _WRITERS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 """Format name and options of meshio by suffix."""
 
-_PIECE = re.compile(rb"<Piece\b")
-_COMPRESSOR = re.compile(rb"""<VTKFile\b[^>]*\bcompressor\s*=\s*["'](\w+)["']""")
-_KNOWN_COMPRESSORS = (b"vtkZLibDataCompressor", b"vtkLZMADataCompressor")
-
 
 def read(path: Path) -> Content:
     """Read a file in any format that meshio knows.
@@ -40,26 +35,6 @@ def read(path: Path) -> Content:
     import meshio  # late: it loads every format it knows
 
     return _content(path, lambda: meshio.read(path))
-
-
-def read_vtu(path: Path) -> Content:
-    """Read a .vtu file of one piece, compressed with zlib, LZMA or not at all.
-
-    Args:
-        path: The file.
-
-    Raises:
-        MeshError: It cannot be read.
-    """
-    text = path.read_bytes()
-    compressor = _COMPRESSOR.search(text)
-    if compressor is not None and compressor.group(1) not in _KNOWN_COMPRESSORS:
-        name = compressor.group(1).decode()[:40]
-        raise MeshError(f"{path} is compressed with {name}, which cannot be read; write it with zlib or uncompressed.")
-    # meshio would read all pieces' points but the cells of the last piece only.
-    if (pieces := len(_PIECE.findall(text))) > 1:
-        raise MeshError(f"{path} consists of {pieces} pieces; merge them into one, as ParaView's filters do.")
-    return read(path)
 
 
 def read_xdmf(path: Path) -> Content:

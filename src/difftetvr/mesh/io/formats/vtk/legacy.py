@@ -9,8 +9,10 @@ from urllib.parse import unquote
 import numpy as np
 
 from difftetvr.errors import MeshError
-from difftetvr.mesh.io.content import CellBlock, Content
-from difftetvr.mesh.io.formats import vtk_cells
+from difftetvr.mesh.io.content import Content
+from difftetvr.mesh.io.formats.vtk.cells import from_legacy
+from difftetvr.mesh.io.formats.vtk.grid import visible_grid
+from difftetvr.mesh.io.formats.vtk.structured import hexahedra, lattice
 from difftetvr.mesh.io.source import Source
 
 _TYPES = {
@@ -39,6 +41,7 @@ _TYPES = {
     "vtktypefloat32": "f4",
     "vtktypefloat64": "f8",
 }
+_TEXTS = ("string", "utf8_string", "variant")
 _ATTRIBUTES = {"vectors": 3, "normals": 3, "tensors": 9, "tensors6": 6, "global_ids": 1, "pedigree_ids": 1}
 
 
@@ -57,6 +60,7 @@ class _State:
         point_data: Arrays by name.
         cell_data: Arrays by name.
         active: The arrays that attributes go to, and the length they have.
+        texts: Names of data that are no numbers.
     """
 
     kind: str = ""
@@ -69,6 +73,7 @@ class _State:
     point_data: dict[str, np.ndarray] = field(default_factory=dict)
     cell_data: dict[str, np.ndarray] = field(default_factory=dict)
     active: tuple[dict[str, np.ndarray], int] | None = None
+    texts: set[str] = field(default_factory=set)
 
 
 def read(path: Path) -> Content:
@@ -181,10 +186,28 @@ def _read_field(source: Source, state: _State, count: int) -> None:
         if len(words) != 4:
             raise source.damaged(f"{words[0][:40]!r} does not begin an array")
         columns, rows = source.count(words[1], "components"), source.count(words[2], "values")
-        values = _array(source, columns * rows, words[3], f"values of {words[0]}")
         # A field before the first data section belongs to the file as a whole, such as its time.
-        if state.active is not None and rows == state.active[1]:
+        is_data = state.active is not None and rows == state.active[1]
+        if words[3].lower() in _TEXTS:
+            _skip_texts(source, columns * rows, words[3].lower())
+            state.texts |= {unquote(words[0])} if is_data else set()
+            continue
+        values = _array(source, columns * rows, words[3], f"values of {words[0]}")
+        if state.active is not None and is_data:
             state.active[0][unquote(words[0])] = values.reshape(rows, columns) if columns != 1 else values
+
+
+def _skip_texts(source: Source, count: int, kind: str) -> None:
+    """Pass over texts: a line each, or in binary their length in 1, 2, 4 or 8 bytes, as its two highest bits say."""
+    for _ in range(count):
+        if source.text or kind == "variant":
+            if source.line() is None:
+                raise source.damaged("its texts are incomplete")
+            continue
+        first = source.take(1, "texts")[0]
+        size = 2 ** (3 - (first >> 6))
+        rest = source.take(size - 1, "texts")
+        source.take(int.from_bytes(bytes([first & 63]) + rest, "big"), "texts")
 
 
 def _skip_metadata(source: Source) -> None:
@@ -213,19 +236,18 @@ def _content(source: Source, state: _State) -> Content:
         if state.vertices is None or state.connectivity is None or state.types is None:
             raise source.damaged("it lacks its points, its cells or their types")
         vertices = state.vertices
-        blocks = vtk_cells.blocks(source.path, state.types, state.connectivity, state.offsets)
-        count = len(state.types)
+        cells = from_legacy(source.path, state.types, state.connectivity, state.offsets)
     elif state.kind in ("structured_points", "structured_grid", "rectilinear_grid"):
         shape = _shape(source, state)
-        vertices = _structured_vertices(source, state, shape)
-        nodes = vtk_cells.structured_hexahedra(shape)
-        blocks, count = (CellBlock("hexahedron", nodes, np.arange(len(nodes))),), len(nodes)
+        vertices, cells = _structured_vertices(source, state, shape), hexahedra(shape)
     else:
         raise MeshError(f"{source.path} holds a data set of kind {state.kind[:40]!r}; give an unstructured grid.")
+    count = len(cells.types)
     for name, length, arrays in (("point", len(vertices), state.point_data), ("cell", count, state.cell_data)):
         if any(len(values) != length for values in arrays.values()):
             raise source.damaged(f"its {name} data are not of the length {length}")
-    return Content(vertices, blocks, state.point_data, state.cell_data)
+    notes = (f"Left out data that are no numbers: {', '.join(sorted(state.texts))}.",) if state.texts else ()
+    return visible_grid(vertices, cells, state.point_data, state.cell_data).content(source.path, notes)
 
 
 def _shape(source: Source, state: _State) -> tuple[int, int, int]:
@@ -251,5 +273,4 @@ def _structured_vertices(source: Source, state: _State, shape: tuple[int, int, i
             axes = [o + s * np.arange(n) for o, s, n in zip(origin, spacing, shape)]
     if any(axis is None or len(axis) != n for axis, n in zip(axes, shape)):
         raise source.damaged("its coordinates are not as many as its dimensions say")
-    z, y, x = np.meshgrid(*(np.asarray(axis) for axis in reversed(axes)), indexing="ij")
-    return np.column_stack((x.ravel(), y.ravel(), z.ravel()))
+    return lattice([np.asarray(axis) for axis in axes])
