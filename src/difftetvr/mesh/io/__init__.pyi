@@ -1,5 +1,7 @@
 from . import content as content
 from . import formats as formats
+from . import hdf5 as hdf5
+from . import isolation as isolation
 from . import loading as loading
 from . import saving as saving
 from . import source as source

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TextIO
 
 import numpy as np
 
-from difftetvr.errors import MeshError
+from difftetvr.errors import MeshError, counted
 
 _LINES_AT_ONCE = 10_000
 
@@ -73,6 +74,34 @@ class Output:
         """(V, 4) or (T, 4) red, green, blue, density; None where there are none."""
         arrays = self.cell_data if self.is_per_cell else self.point_data
         return np.column_stack((arrays["color"], arrays["density"])) if "color" in arrays else None
+
+
+def chosen_step(path: Path, times: Sequence[float], step: int | None) -> tuple[int, tuple[str, ...]]:
+    """Which of a file's time steps to read.
+
+    Args:
+        path: The file.
+        times: Of its steps, in their order.
+        step: The wanted one, from 0; negative ones count from the last; None: the last.
+
+    Returns:
+        Its index, and what to tell who did not choose.
+
+    Raises:
+        MeshError: There is no such step.
+    """
+    count = len(times)
+    index = count - 1 if step is None else step + count if step < 0 else step
+    if not 0 <= index < count:
+        raise MeshError(
+            f"{path} has no time step {step}; its {counted(count, 'step')} have the numbers 0 to {count - 1}."
+        )
+    if step is not None or count == 1:
+        return index, ()
+    note = (
+        f"Of {count:,} time steps the last was read, number {index} at time {times[index]:g}; --step chooses another."
+    )
+    return index, (note,)
 
 
 def damaged(path: Path, problem: str) -> MeshError:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from difftetvr.errors import MeshError
 from difftetvr.mesh.io.content import Content, Output
-from difftetvr.mesh.io.formats import bintet, gmsh, medit, npz, ovm, tetgen, through_meshio, vtk
+from difftetvr.mesh.io.formats import bintet, exodus, medit, npz, ovm, tetgen, through_meshio, unsupported, vtk
+from difftetvr.mesh.io.formats.gmsh import reading as gmsh_reading
+from difftetvr.mesh.io.formats.xdmf import reading as xdmf_reading
+from difftetvr.mesh.io.formats.xdmf import writing as xdmf_writing
 
 
 @dataclass(frozen=True)
@@ -52,26 +54,31 @@ class Format:
 
 
 def format_of(path: Path) -> Format:
-    """The format that a file's suffix names; one that only meshio may know where it is none of ours."""
-    return FORMATS.get(path.suffix.lower(), Format(through_meshio.read))
+    """The format that a file's name ends with; those that meshio reads for us are not in `FORMATS`.
 
-
-def _write_xdmf(path: Path, output: Output) -> None:
-    # Late: it loads meshio and so every format that meshio knows.
-    importlib.import_module("difftetvr.mesh.io.formats.xdmf").write(path, output)
+    Raises:
+        MeshError: It is none that is read.
+    """
+    suffix = path.suffix.lower()
+    if suffix in FORMATS:
+        return FORMATS[suffix]
+    if through_meshio.is_known(path):
+        return Format(through_meshio.read)
+    raise unsupported.sentence(path)
 
 
 FORMATS: dict[str, Format] = {
     ".vtu": Format(through_meshio.read_vtu, through_meshio.write, holds_data=True, holds_harmonics=True),
     ".vtk": Format(vtk.read, through_meshio.write, holds_data=True),
-    ".msh": Format(gmsh.read, through_meshio.write, holds_data=True),
-    ".xdmf": Format(through_meshio.read_xdmf, _write_xdmf, holds_data=True),
-    ".xmf": Format(through_meshio.read_xdmf),
+    ".msh": Format(gmsh_reading.read, through_meshio.write, holds_data=True, has_steps=True),
+    ".xdmf": Format(xdmf_reading.read, xdmf_writing.write, holds_data=True, has_steps=True),
+    ".xmf": Format(xdmf_reading.read, has_steps=True),
     ".npz": Format(npz.read, npz.write, holds_data=True, holds_harmonics=True),
     ".bintet": Format(bintet.read, bintet.write, is_single=True),
     ".ovm": Format(ovm.read, ovm.write),
     ".node": Format(tetgen.read, tetgen.write),
     ".ele": Format(tetgen.read, tetgen.write),
+    **{suffix: Format(exodus.read, has_steps=True) for suffix in (".e", ".exo", ".ex2", ".exoii", ".exii", ".g", ".gen")},
     ".mesh": Format(medit.read, through_meshio.write, holds_field=False),
 }
 """Formats by suffix; those that are written are offered in this order."""
