@@ -80,15 +80,15 @@ def isolated(
             "--allow-large (in Python: with dtv.trusting(large=True))."
         )
     raise MeshError(
-        f"{path} made its reader break off (exit code {code}); it is most likely damaged, so write it again, or convert "
-        "it to .vtu."
+        f"{path} made its reader break off (exit code {code}); it is most likely damaged, so write it again, or "
+        "convert it to .vtu."
     )
 
 
 def _run(request: dict[str, Any], folder: Path) -> int | None:
     """Exit code of the process; None where it did not end in time."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(os.path.abspath(p) for p in sys.path)}
-    environment.update({name: "1" for name in _LIBRARY_THREADS})
+    environment.update(dict.fromkeys(_LIBRARY_THREADS, "1"))
     try:
         return subprocess.run(
             [sys.executable, str(_WORKER), str(folder)],

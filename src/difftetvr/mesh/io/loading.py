@@ -12,7 +12,7 @@ from difftetvr.errors import MeshError, counted
 from difftetvr.mesh.field import Field, Location
 from difftetvr.mesh.io.building import NO_DEFECTS, Defects, Flat, Request, Tets, build_mesh, with_overlaps
 from difftetvr.mesh.io.content import CellBlock, Content, require_array
-from difftetvr.mesh.io.formats.table import format_of
+from difftetvr.mesh.io.formats.table import read_content
 from difftetvr.mesh.making.conversion import CONVERTIBLE, is_quadratic, num_nodes, to_tetrahedra
 from difftetvr.mesh.tetmesh import TetMesh
 
@@ -181,15 +181,7 @@ def _load(request: Request) -> tuple[MeshData, MeshError | None]:
 
 
 def _read(path: Path, step: int | None) -> Content:
-    if path.is_dir():
-        raise MeshError(f"{path} is a folder; give the mesh file in it.")
-    if not path.is_file():
-        raise MeshError(f"There is no mesh file {path}; check the path.")
-    try:
-        content = format_of(path).content(path, step)
-    except OSError as error:
-        reason = error.strerror or type(error).__name__
-        raise MeshError(f"{path} cannot be read ({reason}); check the disk and the file's permissions.") from error
+    content = read_content(path, step)
     require_array(path, "vertices", content.vertices, 3)
     return content
 

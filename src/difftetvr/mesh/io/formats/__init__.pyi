@@ -1,3 +1,4 @@
+from . import abaqus as abaqus
 from . import bintet as bintet
 from . import exodus as exodus
 from . import gmsh as gmsh

@@ -15,6 +15,9 @@ from difftetvr.mesh.io.hdf5 import PlainFile
 from difftetvr.mesh.io.isolation import isolated
 from difftetvr.trust import require_modest
 
+SUFFIXES = (".e", ".exo", ".ex2", ".exoii", ".exii", ".g", ".gen")
+"""Suffixes of Exodus files."""
+
 _FAMILIES = {
     "tetra": (4, 10),
     "hexahedron": (8, 20, 27),

@@ -8,10 +8,11 @@ from pathlib import Path
 
 from difftetvr.errors import MeshError
 from difftetvr.mesh.io.content import Content, Output
-from difftetvr.mesh.io.formats import bintet, exodus, medit, npz, ovm, tetgen, through_meshio, unsupported, vtk
+from difftetvr.mesh.io.formats import abaqus, bintet, exodus, medit, npz, ovm, tetgen, through_meshio, unsupported, vtk
 from difftetvr.mesh.io.formats.gmsh import reading as gmsh_reading
 from difftetvr.mesh.io.formats.xdmf import reading as xdmf_reading
 from difftetvr.mesh.io.formats.xdmf import writing as xdmf_writing
+from difftetvr.trust import require_regular
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,28 @@ def format_of(path: Path) -> Format:
     raise unsupported.sentence(path)
 
 
+def read_content(path: Path, step: int | None = None) -> Content:
+    """Read a file in any format.
+
+    Args:
+        path: The file.
+        step: Its time step to read; see `Format.content`.
+
+    Raises:
+        MeshError: There is no such file, or it cannot be read.
+    """
+    if path.is_dir():
+        raise MeshError(f"{path} is a folder; give the mesh file in it.")
+    require_regular(path, MeshError)
+    if not path.is_file():
+        raise MeshError(f"There is no mesh file {path}; check the path.")
+    try:
+        return format_of(path).content(path, step)
+    except OSError as error:
+        reason = error.strerror or type(error).__name__
+        raise MeshError(f"{path} cannot be read ({reason}); check the disk and the file's permissions.") from error
+
+
 FORMATS: dict[str, Format] = {
     ".vtu": Format(through_meshio.read_vtu, through_meshio.write, holds_data=True, holds_harmonics=True),
     ".vtk": Format(vtk.read, through_meshio.write, holds_data=True),
@@ -78,7 +101,11 @@ FORMATS: dict[str, Format] = {
     ".ovm": Format(ovm.read, ovm.write),
     ".node": Format(tetgen.read, tetgen.write),
     ".ele": Format(tetgen.read, tetgen.write),
-    **{suffix: Format(exodus.read, has_steps=True) for suffix in (".e", ".exo", ".ex2", ".exoii", ".exii", ".g", ".gen")},
+    **{
+        suffix: Format(exodus.read, has_steps=True)
+        for suffix in (".e", ".exo", ".ex2", ".exoii", ".exii", ".g", ".gen")
+    },
+    ".inp": Format(abaqus.read),
     ".mesh": Format(medit.read, through_meshio.write, holds_field=False),
 }
 """Formats by suffix; those that are written are offered in this order."""

@@ -12,7 +12,10 @@ _PARTS = {
     ".case": ("the list of an EnSight result, whose data lie in several files", _CONVERT),
     ".encas": ("the list of an EnSight result, whose data lie in several files", _CONVERT),
     ".geo": ("a geometry (of Gmsh or EnSight), no volume mesh", "mesh it with Gmsh, or " + _CONVERT),
-    ".foam": ("a marker for a folder of OpenFOAM, whose data lie in several files", "run foamToVTK there, or " + _CONVERT),
+    ".foam": (
+        "a marker for a folder of OpenFOAM, whose data lie in several files",
+        "run foamToVTK there, or " + _CONVERT,
+    ),
     ".openfoam": ("a marker for a folder of OpenFOAM", "run foamToVTK there, or " + _CONVERT),
     ".sol": ("data for the vertices of a mesh that lies in another file", "give the .mesh, or convert both to .vtu"),
     ".solb": ("data for the vertices of a mesh that lies in another file", "give the .mesh, or convert both to .vtu"),

@@ -165,15 +165,16 @@ def _only_mesh(source: Source, state: _State) -> _Mesh:
     if not state.meshes and state.views.names:
         names = ", ".join(repr(name[:40]) for name in state.views.names[:8])
         raise MeshError(
-            f"{source.path} holds data ({names}) without their mesh, which lies in another file; merge both in Gmsh and "
-            "save them into one."
+            f"{source.path} holds data ({names}) without their mesh, which lies in another file; merge both in Gmsh "
+            "and save them into one."
         )
     if not state.meshes:
         raise source.damaged("it lacks its nodes")
     first = state.meshes[0]
     if not all(mesh.equals(first) for mesh in state.meshes[1:]):
         raise MeshError(
-            f"{source.path} holds {len(state.meshes)} meshes that differ; save each into a file of its own, or merge them."
+            f"{source.path} holds {len(state.meshes)} meshes that differ; save each into a file of its own, or "
+            "merge them."
         )
     return first
 

@@ -117,7 +117,8 @@ class Items:
         if item.get("Compression", "Raw").lower() not in ("raw", "none"):
             raise MeshError(f"{self.path} has compressed binary arrays, which are not read; write them in HDF5.")
         kind, seek = self._type(item), item.get("Seek", "0")
-        stored = kind.newbyteorder({"big": ">", "little": "<"}.get(item.get("Endian", "Native").lower(), "="))
+        endian = item.get("Endian", "Native").lower()
+        stored = kind.newbyteorder(">" if endian == "big" else "<" if endian == "little" else "=")
         count = math.prod(self._shape(item))
         self._require_there(file)
         size = file.stat().st_size

@@ -71,7 +71,8 @@ class _Reader:
         if not tops:
             raise damaged(self.path, "it has no grid")
         keys = sorted({key for grid in tops for key in self._keys(grid, 0)})
-        key, notes = None, ()
+        key: _Key | None = None
+        notes: tuple[str, ...] = ()
         if keys:
             index, notes = chosen_step(self.path, [time for time, _ in keys], step)
             key = keys[index]
@@ -220,4 +221,4 @@ class _Reader:
 
 
 def _kind(grid: Element) -> str:
-    return grid.get("GridType", grid.get("CollectionType") and "Collection" or "Uniform").lower()
+    return grid.get("GridType", "Collection" if "CollectionType" in grid.attrib else "Uniform").lower()

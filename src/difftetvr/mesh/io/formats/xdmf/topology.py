@@ -38,19 +38,38 @@ _KINDS = {
 }
 """Name and number of nodes of a kind, by XDMF's number."""
 
-_NUMBERS = {
-    **{"polyvertex": 1, "polyline": 2, "polygon": 3, "triangle": 4, "quadrilateral": 5, "quad": 5},
-    **{"tetrahedron": 6, "tet": 6, "pyramid": 7, "wedge": 8, "hexahedron": 9, "hex": 9, "polyhedron": 16},
-    **{"edge_3": 0x22, "quadrilateral_9": 0x23, "quad_9": 0x23, "triangle_6": 0x24, "tri_6": 0x24},
-    **{"quadrilateral_8": 0x25, "quad_8": 0x25, "tetrahedron_10": 0x26, "tet_10": 0x26, "pyramid_13": 0x27},
-    **{"wedge_15": 0x28, "wedge_18": 0x29, "hexahedron_20": 0x30, "hex_20": 0x30, "hexahedron_24": 0x31},
-    **{"hex_24": 0x31, "hexahedron_27": 0x32, "hex_27": 0x32, "hexahedron_64": 0x33, "hex_64": 0x33},
-    **{"hexahedron_125": 0x34, "hex_125": 0x34},
+_NAMES = {
+    "edge": "line",
+    "tri": "triangle",
+    "triangle": "triangle",
+    "quad": "quad",
+    "quadrilateral": "quad",
+    "tet": "tetra",
+    "tetrahedron": "tetra",
+    "pyramid": "pyramid",
+    "wedge": "wedge",
+    "hex": "hexahedron",
+    "hexahedron": "hexahedron",
 }
-"""XDMF's number of a kind, by its names in lower case."""
+"""XDMF's names of families of kinds, in lower case."""
 
 _POLYVERTEX, _POLYLINE, _POLYGON, _POLYHEDRON = 1, 2, 3, 16
 _SIZE_FOLLOWS = (_POLYVERTEX, _POLYLINE, _POLYGON, _POLYHEDRON)
+_NUMBERS = {
+    "polyvertex": _POLYVERTEX,
+    "polyline": _POLYLINE,
+    "polygon": _POLYGON,
+    "polyhedron": _POLYHEDRON,
+    **{name: number for name, family in _NAMES.items() for number, (kind, _) in _KINDS.items() if kind == family},
+    **{
+        f"{name}_{size}": number
+        for name, family in _NAMES.items()
+        for number, (kind, size) in _KINDS.items()
+        if kind.startswith(family)
+    },
+}
+"""XDMF's number of a kind, by its names in lower case."""
+
 _STRUCTURED = ("3dsmesh", "3drectmesh", "3dcorectmesh")
 
 
