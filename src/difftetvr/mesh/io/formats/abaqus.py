@@ -186,10 +186,10 @@ def _content(path: Path, state: _State) -> Content:
         begin += len(rows)
     blocks = []
     for kind, found in parts.items():
-        nodes, rows = ([part[i] for part in found] for i in range(2))
-        is_table = len({part.shape[1] for part in nodes}) == 1
-        table = np.concatenate(nodes) if is_table else np.empty((sum(map(len, nodes)), 0), np.int64)
-        blocks.append(CellBlock(kind, table, np.concatenate(rows)))
+        of_all = np.concatenate([part[1] for part in found])
+        is_table = len({nodes.shape[1] for nodes, _ in found}) == 1
+        table = np.concatenate([nodes for nodes, _ in found]) if is_table else np.empty((len(of_all), 0), np.int64)
+        blocks.append(CellBlock(kind, table, of_all))
     cell_data = {"abaqus:elset": np.concatenate(numbers)} if sets else {}
     return Content(np.array(state.points), tuple(blocks), {}, cell_data, _notes(state, sets))
 

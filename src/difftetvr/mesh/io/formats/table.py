@@ -101,10 +101,7 @@ FORMATS: dict[str, Format] = {
     ".ovm": Format(ovm.read, ovm.write),
     ".node": Format(tetgen.read, tetgen.write),
     ".ele": Format(tetgen.read, tetgen.write),
-    **{
-        suffix: Format(exodus.read, has_steps=True)
-        for suffix in (".e", ".exo", ".ex2", ".exoii", ".exii", ".g", ".gen")
-    },
+    **dict.fromkeys(exodus.SUFFIXES, Format(exodus.read, has_steps=True)),
     ".inp": Format(abaqus.read),
     ".mesh": Format(medit.read, through_meshio.write, holds_field=False),
 }
