@@ -133,8 +133,9 @@ def test_flat_meshes_and_damage_are_a_sentence(tmp_path):
     path.write_bytes(b"certainly no mesh")
     with pytest.raises(MeshError, match="does not begin as files of NetCDF do"):
         load_data(path)
-    for form in ("NETCDF4", "NETCDF3_CLASSIC"):
+    for form in ("NETCDF4", "NETCDF3_CLASSIC", "NETCDF3_64BIT_OFFSET", "NETCDF3_64BIT_DATA"):
         write(path, form)
+        assert exodus.read_here(path, None).point_data["p"].max() == 29
         content = path.read_bytes()
         for end in (100, len(content) // 2, len(content) - 8):
             path.write_bytes(content[:end])

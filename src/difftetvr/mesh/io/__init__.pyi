@@ -3,6 +3,7 @@ from . import formats as formats
 from . import hdf5 as hdf5
 from . import isolation as isolation
 from . import loading as loading
+from . import netcdf as netcdf
 from . import saving as saving
 from . import source as source
 from .formats.npz import is_mesh_archive as is_mesh_archive

@@ -13,6 +13,7 @@ from difftetvr.errors import MeshError, counted
 from difftetvr.mesh.io.content import CellBlock, Content, chosen_step, damaged
 from difftetvr.mesh.io.hdf5 import PlainFile
 from difftetvr.mesh.io.isolation import isolated
+from difftetvr.mesh.io.netcdf import require_whole
 from difftetvr.trust import require_modest
 
 SUFFIXES = (".e", ".exo", ".ex2", ".exoii", ".exii", ".g", ".gen")
@@ -88,6 +89,8 @@ def read_here(path: Path, step: int | None) -> Content:
     if is_hdf5:
         with PlainFile(path) as plain:
             plain.require_plain(sized=False)
+    else:
+        require_whole(path)
     try:
         with netCDF4.Dataset(str(path.resolve())) as file:
             file.set_auto_maskandscale(False)
