@@ -14,7 +14,9 @@ SECOND = "*Element, elset=skin , type=c3d4h\n2, 2, 3,\n4, 70\n*ELSET, ELSET=othe
 
 def test_sets_types_and_rows_that_go_on(tmp_path):
     shells = "*ELEMENT, TYPE=S3, ELSET=shell\n7, 1,2,3\n*ELEMENT, TYPE=COH3D8\n8, 1,2,3,4,1,2,3,4\n"
-    (tmp_path / "a.inp").write_text(f"** made by hand\n*HEADING\nBone, of 2 = two parts\n{NODES}{shells}{FIRST}{SECOND}")
+    (tmp_path / "a.inp").write_text(
+        f"** made by hand\n*HEADING\nBone, of 2 = two parts\n{NODES}{shells}{FIRST}{SECOND}"
+    )
     found = load_data(tmp_path / "a.inp")
     assert found.mesh.tets.sort(1).values.tolist() == [[0, 1, 2, 3], [1, 2, 3, 4]]
     assert found.cell_data["abaqus:elset"].tolist() == [2, 3]

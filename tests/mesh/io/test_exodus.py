@@ -31,7 +31,12 @@ def names(file, variable, dimension, words):
 def write(path, form="NETCDF4", blocks=BLOCKS, points=POINTS, times=(0.0, 0.5, 1.5), old=False):
     """Node variables are p = 10 step + node and q = -step; e is 100 step + element, f only in the second block."""
     with netCDF4.Dataset(path, "w", format=form) as file:
-        for name, size in (("len_string", 33), ("num_dim", points.shape[1]), ("num_nodes", len(points)), ("time_step", None)):
+        for name, size in (
+            ("len_string", 33),
+            ("num_dim", points.shape[1]),
+            ("num_nodes", len(points)),
+            ("time_step", None),
+        ):
             file.createDimension(name, size)
         file.createDimension("num_el_blk", len(blocks))
         if old:
@@ -71,7 +76,9 @@ def write(path, form="NETCDF4", blocks=BLOCKS, points=POINTS, times=(0.0, 0.5, 1
                     both[k][step] = values
 
 
-@pytest.mark.parametrize(("form", "old"), [("NETCDF4", False), ("NETCDF3_64BIT_OFFSET", False), ("NETCDF3_CLASSIC", True)])
+@pytest.mark.parametrize(
+    ("form", "old"), [("NETCDF4", False), ("NETCDF3_64BIT_OFFSET", False), ("NETCDF3_CLASSIC", True)]
+)
 def test_blocks_variables_and_steps(tmp_path, form, old):
     path = tmp_path / "a.exo"
     write(path, form, old=old)

@@ -55,7 +55,13 @@ class Writer:
         """The points, with parameters for those in a surface, and one tetrahedron in each volume."""
         low, high = ("i", [2, 4, 1]), ("i", [3, 1, 0])
         if self.version == "4.1":
-            nodes = [("n", [2, 5, 10, 70]), low, ("n", 2), ("t", TAGS[:2]), ("d", np.hstack([POINTS[:2], POINTS[:2, 1:]]))]
+            nodes = [
+                ("n", [2, 5, 10, 70]),
+                low,
+                ("n", 2),
+                ("t", TAGS[:2]),
+                ("d", np.hstack([POINTS[:2], POINTS[:2, 1:]])),
+            ]
             nodes += [high, ("n", 3), ("t", TAGS[2:]), ("d", POINTS[2:])]
             blocks = [("i", [3, volumes[0], 4]), ("i", [3, volumes[1], 4])]
         else:
@@ -139,7 +145,9 @@ def test_blocks_of_one_are_read_as_one(tmp_path):
     elements = [tets[0], triangle, triangle.replace(b"\5", b"\6"), tets[1], *many]
     nodes = b"".join(struct.pack("<i3d", i + 1, *p) for i, p in enumerate(POINTS))
     path = tmp_path / "a.msh"
-    head = b"$MeshFormat\n2.2 1 8\n" + struct.pack("<i", 1) + b"\n$EndMeshFormat\n$Nodes\n5\n" + nodes + b"\n$EndNodes\n"
+    head = (
+        b"$MeshFormat\n2.2 1 8\n" + struct.pack("<i", 1) + b"\n$EndMeshFormat\n$Nodes\n5\n" + nodes + b"\n$EndNodes\n"
+    )
     path.write_bytes(head + b"$Elements\n104\n" + b"".join(elements) + b"\n$EndElements\n")
     content = reading.read(path)
     found = {block.kind: block for block in content.cells}

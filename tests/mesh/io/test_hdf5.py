@@ -146,7 +146,7 @@ def test_damaged_files_are_a_sentence(inside):
         with pytest.raises(MeshError, match=r"a\.h5 cannot be read"):
             hdf5.PlainFile(inside / "a.h5").array("/p")
     (inside / "a.h5").unlink()
-    with pytest.raises(MeshError, match="'a.h5', which is not there; put it beside it"):
+    with pytest.raises(MeshError, match=r"'a\.h5', which is not there; put it beside it"):
         load_data(inside / "a.xdmf")
 
 

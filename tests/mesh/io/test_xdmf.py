@@ -66,17 +66,25 @@ SERIES = {
     "dolfinx": grid(MESH, name="mesh")
     + collection(
         "Temporal",
-        *[grid(INCLUDE.format("/Xdmf/Domain/Grid[@GridType='Uniform'][1]/*[self::Topology or self::Geometry]"), s) for s in STEPS],
+        *[
+            grid(INCLUDE.format("/Xdmf/Domain/Grid[@GridType='Uniform'][1]/*[self::Topology or self::Geometry]"), s)
+            for s in STEPS
+        ],
         name="u",
     ),
     "mesh in every step": collection("Temporal", *[grid(MESH, s) for s in STEPS]),
     "FEniCS": collection(
         "Temporal",
         grid(MESH, STEPS[0]),
-        *[grid(INCLUDE.format('//Grid[@Name=&quot;c&quot;]/*[1]/*[self::Topology or self::Geometry]'), s) for s in STEPS[1:]],
+        *[
+            grid(INCLUDE.format("//Grid[@Name=&quot;c&quot;]/*[1]/*[self::Topology or self::Geometry]"), s)
+            for s in STEPS[1:]
+        ],
     ),
     "meshio": grid(MESH, name="mesh")
-    + collection("Temporal", *[grid(INCLUDE.format("//Grid[@Name='mesh']/*[self::Topology|self::Geometry]"), s) for s in STEPS]),
+    + collection(
+        "Temporal", *[grid(INCLUDE.format("//Grid[@Name='mesh']/*[self::Topology|self::Geometry]"), s) for s in STEPS]
+    ),
     "references": collection(
         "Temporal",
         grid(MESH, STEPS[0]),
@@ -105,9 +113,7 @@ def test_time_series(write, program):
     found = load_data(path, torch.float64)
     assert torch.equal(found.mesh.vertices, torch.from_numpy(POINTS)) and found.mesh.num_cells == 2
     assert found.point_data["u"].tolist() == (POINTS[:, 0] + 2).tolist()
-    assert found.warnings == (
-        "Of 3 time steps the last was read, number 2 at time 1; --step chooses another.",
-    )
+    assert found.warnings == ("Of 3 time steps the last was read, number 2 at time 1; --step chooses another.",)
     first = load_data(path, torch.float64, step=0)
     assert first.point_data["u"].tolist() == POINTS[:, 0].tolist() and not first.warnings
     assert set(first.point_data) == ({"u", "p"} if program == "two quantities" else {"u"})
@@ -137,7 +143,9 @@ def test_tags_of_cells_are_no_second_mesh(write):
 
 def test_parts_of_a_collection_are_one_mesh(write):
     parts = [
-        grid(topology(), geometry(POINTS + 2.0 * k), attribute("p", np.full(5, float(k))), attribute("c", [k, k], "Cell"))
+        grid(
+            topology(), geometry(POINTS + 2.0 * k), attribute("p", np.full(5, float(k))), attribute("c", [k, k], "Cell")
+        )
         for k in range(2)
     ]
     only = attribute("only", [7.0, 8.0], "Cell") + "</Grid>"
@@ -149,8 +157,17 @@ def test_parts_of_a_collection_are_one_mesh(write):
     assert found.cell_data["only"][:2].isnan().all() and found.cell_data["only"][2:].tolist() == [7, 8]
 
 
+def test_two_meshes_side_by_side_are_said(write):
+    found = load_data(write(grid(MESH), grid(topology(), geometry(POINTS + 2))))
+    assert found.mesh.num_cells == 4
+    assert found.warnings == ("Put 2 meshes together, each with points of its own.",)
+
+
 def test_collections_in_collections(write):
-    steps = [collection("Spatial", time(k), *[grid(topology(), geometry(POINTS + 2.0 * i + k)) for i in range(2)]) for k in range(2)]
+    steps = [
+        collection("Spatial", time(k), *[grid(topology(), geometry(POINTS + 2.0 * i + k)) for i in range(2)])
+        for k in range(2)
+    ]
     found = load_data(write(collection("Temporal", *steps)), step=1)
     assert found.mesh.num_cells == 4 and found.mesh.vertices.min() == 1
 
@@ -175,7 +192,9 @@ def test_mixed_and_structured_cells(write):
 
 
 def test_quadratic_cells_by_any_name(write):
-    points = np.concatenate([POINTS[:4], [(POINTS[a] + POINTS[b]) / 2 for a, b in ((0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3))]])
+    points = np.concatenate(
+        [POINTS[:4], [(POINTS[a] + POINTS[b]) / 2 for a, b in ((0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3))]]
+    )
     for kind in ("Tetrahedron_10", "Tet_10", "TET_10", "38"):
         found = load_data(write(grid(topology(np.arange(10)[None], kind), geometry(points))), split=True)
         assert found.mesh.num_vertices == 4 and "Straightened 1 cell" in found.warnings[0]
@@ -201,7 +220,9 @@ def test_what_is_left_out_is_said(write):
     found = load_data(path)
     assert set(found.point_data) == {"p"}
     (note,) = found.warnings
-    assert all(name in note for name in ("'edges' (data of each Edge)", "'short' (3 numbers for 5 rows)", "set 'inlet'"))
+    assert all(
+        name in note for name in ("'edges' (data of each Edge)", "'short' (3 numbers for 5 rows)", "set 'inlet'")
+    )
 
 
 @pytest.mark.parametrize(
@@ -218,7 +239,10 @@ def test_what_is_left_out_is_said(write):
         (grid(INCLUDE.format("//Grid[@Name='x']/*")), "leads to nothing"),
         (collection("Temporal", '<Grid Reference="/Xdmf/Domain/Grid"/>'), "in each other without end"),
         (collection("Spatial", *['<Grid Reference="/Xdmf/Domain/Grid"/>'] * 40), "in each other without end"),
-        (grid(topology(), '<Geometry><DataItem Reference="XML">//DataItem[2]</DataItem></Geometry>'), "leads to nothing"),
+        (
+            grid(topology(), '<Geometry><DataItem Reference="XML">//DataItem[2]</DataItem></Geometry>'),
+            "leads to nothing",
+        ),
         (
             grid(topology(), '<Geometry><DataItem Reference="XML">//Geometry/DataItem</DataItem></Geometry>'),
             "refer to each other without end",
@@ -243,7 +267,9 @@ def test_many_references_to_one_large_array_are_refused(write, monkeypatch):
     monkeypatch.setattr("difftetvr.trust.UNPACKED_BYTES", 10_000)
     monkeypatch.setattr("difftetvr.trust._USUAL_RATIO", 1)
     once = attribute("a", np.arange(5.0))
-    again = '<Attribute Name="{}" Center="Node"><DataItem Reference="XML">//Attribute[1]/DataItem</DataItem></Attribute>'
+    again = (
+        '<Attribute Name="{}" Center="Node"><DataItem Reference="XML">//Attribute[1]/DataItem</DataItem></Attribute>'
+    )
     path = write(grid(MESH, once, *[again.format(i) for i in range(400)]))
     assert path.stat().st_size < 60_000
     assert len(load_data(path).point_data) == 401

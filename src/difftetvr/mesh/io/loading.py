@@ -64,7 +64,7 @@ def load(
     converted as they are, without scaling.
 
     Args:
-        path: .vtu, .vtk, .msh, .mesh, .xdmf, .npz, .bintet, .ovm, .node or .ele, or what else meshio reads.
+        path: .vtu, .vtk, .msh, .mesh, .xdmf, .npz, .bintet, .ovm, .node or .ele, or another that the manual lists.
         dtype: Floating-point type of vertices, colours and densities. Files of this type round-trip to the bit. None:
             float32, or float64 where rounding to that would flatten or invert a cell.
         split: Split hexahedra, wedges and pyramids into tetrahedra, and straighten quadratic cells.

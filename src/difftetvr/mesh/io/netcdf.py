@@ -1,6 +1,7 @@
 """Whether a classic NetCDF file is whole: its library reads zeros where one was cut off.
 
-NetCDF Classic Format Specification, Unidata: the header lists dimensions, attributes and variables, and where these are.
+NetCDF Classic Format Specification, Unidata: the header lists dimensions, attributes and variables, and where they
+begin.
 """
 
 from __future__ import annotations

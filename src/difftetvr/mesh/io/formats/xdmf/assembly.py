@@ -24,11 +24,14 @@ class Assembly:
 
     A grid with the points of one before has these points, not others at the same places; and so it is with each of its
     cells. Programs write a grid for each quantity, and sets of cells as grids, too.
+
+    Attributes:
+        num_points: Number of all points so far.
     """
 
     def __init__(self) -> None:
         self._points: dict[bytes, tuple[int, np.ndarray]] = {}
-        self._num_points = 0
+        self.num_points = 0
         self._num_cells = 0
         self._cells: dict[str, list[CellBlock]] = {}
         self._data: dict[str, dict[str, list[_Data]]] = {"point": {}, "cell": {}}
@@ -46,8 +49,8 @@ class Assembly:
         digest = hashlib.blake2b(vertices.data if vertices.size else b"", digest_size=16).digest()
         is_new = digest not in self._points
         if is_new:
-            self._points[digest] = self._num_points, vertices
-            self._num_points += len(vertices)
+            self._points[digest] = self.num_points, vertices
+            self.num_points += len(vertices)
         begin = self._points[digest][0]
         rows = np.full(shape.num_cells, -1, np.int64)
         for block in shape.cells:
@@ -87,7 +90,7 @@ class Assembly:
         """What was put together."""
         arrays = [vertices for _, vertices in self._points.values()]
         cells = tuple(_joined(kind, blocks) for kind, blocks in self._cells.items())
-        point_data = {n: _spread(data, self._num_points) for n, data in self._data["point"].items()}
+        point_data = {n: _spread(data, self.num_points) for n, data in self._data["point"].items()}
         cell_data = {n: _spread(data, self._num_cells) for n, data in self._data["cell"].items()}
         return Content(np.concatenate(arrays or [np.empty((0, 3))]), cells, point_data, cell_data, notes)
 

@@ -79,11 +79,16 @@ class _Reader:
         elif step is not None:
             raise MeshError(f"{self.path} has no time steps; leave out --step.")
         assembly, shapes = Assembly(), dict[tuple[int, int], Shape]()
-        grids = [found for grid in tops for found in self._chosen(grid, key, 0)]
-        if not grids:
+        added = 0
+        for top in tops:
+            before = assembly.num_points
+            for grid in self._chosen(top, key, 0):
+                self._add(assembly, shapes, grid)
+            added += assembly.num_points > before
+        if not added:
             raise damaged(self.path, "no grid of it has points and cells at this time")
-        for grid in grids:
-            self._add(assembly, shapes, grid)
+        if added > 1:
+            notes = (*notes, f"Put {added} meshes together, each with points of its own.")
         if self.left_out:
             notes = (*notes, f"Left out: {', '.join(self.left_out)}.")
         return assembly.content(notes)
