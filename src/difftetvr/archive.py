@@ -73,7 +73,7 @@ def read_array(path: str | Path, error: type[DiffTetError]) -> np.ndarray:
     try:
         with path.open("rb") as file:
             header = _Header.of(file, os.path.getsize(path))
-            return header.array(file.read(header.data_size))
+            return header.array(bytearray(file.read(header.data_size)))  # so that it can be written to
     except OSError as problem:
         raise error(f"Cannot read {path}: {problem.strerror or problem}; check the path and the disk.") from problem
     except MemoryError as problem:

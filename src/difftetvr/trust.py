@@ -92,7 +92,7 @@ def file_beside(owner: Path, name: str | os.PathLike[str], error: type[DiffTetEr
     except (OSError, ValueError) as problem:  # a null character, a circle of links
         raise error(f"{owner} names the file {_shortened(text)!r}, which is no path; correct it.") from problem
     roots = [Path(os.path.realpath(folder))]
-    if (outside := _trust().outside) is not None:
+    if (outside := current_trust().outside) is not None:
         roots.append(outside)
     if not any(target.is_relative_to(root) for root in roots):
         raise error(
@@ -138,7 +138,7 @@ def require_modest(path: Path, size: int, what: str, error: type[DiffTetError]) 
             f"{path} holds {what} of {_bytes(size)}, but only {_bytes(free)} of memory can be used; make them smaller "
             "or use a machine with more."
         )
-    if _trust().large:
+    if current_trust().large:
         return free
     try:
         packed = os.path.getsize(path)
@@ -153,7 +153,8 @@ def require_modest(path: Path, size: int, what: str, error: type[DiffTetError]) 
     return most
 
 
-def _trust() -> Trust:
+def current_trust() -> Trust:
+    """What the caller allows; for readers that run in a process of their own and have to be told there."""
     return _TRUST.get() or Trust()
 
 

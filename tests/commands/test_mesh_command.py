@@ -72,7 +72,7 @@ def test_what_cannot_be_meshed_is_one_sentence(tmp_path, capsys):
     assert "(N, 3)" in fails(capsys, "mesh", tmp_path / "plane.npy", *delaunay)
     assert "'points'" in fails(capsys, "mesh", tmp_path / "other.npz", *delaunay)
     assert "cannot be read as points" in fails(capsys, "mesh", tmp_path / "words.txt", *delaunay)
-    assert "cannot be read as points" in fails(capsys, "mesh", tmp_path / "broken.ply", *delaunay)
+    assert "cannot be read as a mesh" in fails(capsys, "mesh", tmp_path / "broken.ply", *delaunay)
     assert "no file of points" in fails(capsys, "mesh", tmp_path / "nothing.npy", *delaunay)
     assert "takes no" in fails(capsys, "mesh", tmp_path / "flat.npy", *delaunay, "--cells", 5)
     assert "grid cuts" in fails(capsys, "mesh", tmp_path / "flat.npy", "--mesher", "grid", "-o", output)

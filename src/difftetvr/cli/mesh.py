@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 import math
-import zipfile
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -14,10 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
+from difftetvr.archive import read_array, read_arrays
 from difftetvr.cli.options import Output, TrustOptions
 from difftetvr.errors import MeshError, counted
 from difftetvr.files import require_writable
 from difftetvr.terminal import waiting
+from difftetvr.trust import require_regular
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -104,7 +103,7 @@ class Mesh:
 
 
 def load_points(path: Path) -> NDArray[Any]:
-    """Read points: .npy, .npz with an array ``points``, text with three numbers a line, or a mesh that meshio reads.
+    """Read points: .npy, .npz with an array ``points``, text with three numbers a line, or any mesh.
 
     Args:
         path: The file; .xyz, .txt and .csv are text, in which lines that begin with # are left out.
@@ -115,23 +114,25 @@ def load_points(path: Path) -> NDArray[Any]:
     Raises:
         MeshError: The file cannot be read, or holds something else.
     """
+    from difftetvr.mesh.io.formats.table import read_content
+
+    require_regular(path, MeshError)
     if not path.is_file():
         raise MeshError(f"There is no file of points {path}; check the path.")
     suffix = path.suffix.lower()
     try:
         if suffix == ".npy":
-            points = np.load(path, allow_pickle=False)
+            points = read_array(path, MeshError)
         elif suffix == ".npz":
-            with np.load(path, allow_pickle=False) as archive:
-                points = archive["points"]
+            points = read_arrays(path, MeshError, lambda name, _: name == "points")["points"]
         elif suffix in (".xyz", ".txt", ".csv"):
             delimiter = "," if suffix == ".csv" else None
             points = np.loadtxt(path, delimiter=delimiter, usecols=(0, 1, 2), ndmin=2)
         else:
-            points = _meshio_points(path)
+            points = read_content(path).vertices
     except KeyError as error:
         raise MeshError(f"{path} has no array 'points'; store the points under this name.") from error
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
+    except (ValueError, OSError) as error:
         reason = " ".join(str(error).split()).rstrip(".")
         raise MeshError(
             f"{path} cannot be read as points ({reason}); give .npy, .npz, .ply, .xyz, .txt or .csv."
@@ -139,19 +140,3 @@ def load_points(path: Path) -> NDArray[Any]:
     if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":
         raise MeshError(f"{path} holds {points.dtype} of shape {points.shape}; points must be numbers of shape (N, 3).")
     return points
-
-
-def _meshio_points(path: Path) -> NDArray[Any]:
-    import meshio  # late: it loads every format it knows
-
-    from difftetvr.mesh.making.surfaces import require_whole
-
-    require_whole(path)
-    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-        try:
-            return np.asarray(meshio.read(path).points)
-        except MemoryError:
-            raise
-        # meshio's readers fail on broken files with whatever their parsers raise, or leave the process.
-        except (Exception, SystemExit) as error:
-            raise ValueError("no reader understands it" if isinstance(error, SystemExit) else str(error)) from error

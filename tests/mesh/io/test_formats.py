@@ -212,7 +212,7 @@ def test_gmsh_4_in_several_blocks(tmp_path, parametric):
     high = "\n".join(" ".join(map(str, p)) for p in POINTS[2:])
     path = tmp_path / "a.msh"
     path.write_text(
-        "$MeshFormat\n4.1 0 8\n$EndMeshFormat\n$Entities\n0 0 1 1\nanything\n$EndEntities\n$Nodes\n2 5 1 30\n"
+        "$MeshFormat\n4.1 0 8\n$EndMeshFormat\n$Anything\n0 0 1 1\nanything\n$EndAnything\n$Nodes\n2 5 1 30\n"
         f"2 1 {parametric} 2\n1\n2\n{low}\n3 1 0 3\n10\n20\n30\n{high}\n$EndNodes\n"
         "$Elements\n3 3 1 3\n2 1 2 1\n1 1 2 10\n3 1 4 1\n2 1 2 10 20\n3 2 4 1\n3 2 10 20 30\n$EndElements\n"
     )
@@ -220,9 +220,6 @@ def test_gmsh_4_in_several_blocks(tmp_path, parametric):
     assert torch.equal(data.mesh.vertices, torch.from_numpy(POINTS).float())
     assert data.mesh.num_cells == 2
     assert data.cell_data["gmsh:geometrical"].tolist() == [1, 2]
-    path.write_text("$MeshFormat\n4.0 0 8\n$EndMeshFormat\n")
-    with pytest.raises(MeshError, match=r"Gmsh's format 4\.0; save it again in format 4\.1 or 2\.2"):
-        load_data(path)
 
 
 def test_medit_as_others_write_it(tmp_path):
@@ -256,10 +253,11 @@ def test_xdmf_with_binary_files_beside_it_only(tmp_path):
     path.write_text(text.format(points.replace("5 3", "50000000000 3"), tets))
     with pytest.raises(MeshError, match=r"p\.bin is shorter than announced"):
         load_mesh(path)
-    for name in ("../p.bin", "/dev/zero", "q.bin"):
+    outside, absent = "lies outside of its folder", "which is not there; put it beside it"
+    for name, message in (("../p.bin", outside), ("/dev/zero", outside), ("q.bin", absent)):
         path.write_text(text.format(points.replace("p.bin", name), tets))
-        with pytest.raises(MeshError, match="there is no file"):
+        with pytest.raises(MeshError, match=message):
             load_mesh(path)
     path.write_text(text.format('<DataItem Dimensions="5 3" Format="HDF">a.h5:/p</DataItem>', tets))
-    with pytest.raises(MeshError, match=r"h5py|there is no file"):
+    with pytest.raises(MeshError, match=f"h5py|{absent}"):
         load_mesh(path)

@@ -1,6 +1,9 @@
 from . import content as content
 from . import formats as formats
+from . import hdf5 as hdf5
+from . import isolation as isolation
 from . import loading as loading
+from . import netcdf as netcdf
 from . import saving as saving
 from . import source as source
 from . import tetrahedra as tetrahedra

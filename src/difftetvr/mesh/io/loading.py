@@ -12,7 +12,7 @@ from difftetvr.errors import MeshError
 from difftetvr.mesh.field import Field, Location
 from difftetvr.mesh.io.building import NO_DEFECTS, Defects, Flat, Request, build_mesh, with_overlaps
 from difftetvr.mesh.io.content import Content, require_array
-from difftetvr.mesh.io.formats.table import format_of
+from difftetvr.mesh.io.formats.table import read_content
 from difftetvr.mesh.io.tetrahedra import tetrahedra_of
 from difftetvr.mesh.tetmesh import TetMesh
 
@@ -62,8 +62,8 @@ def load(
     converted as they are, without scaling.
 
     Args:
-        path: .vtu and the other XML files of VTK, .vtk, .msh, .mesh, .xdmf, .npz, .bintet, .ovm, .node or .ele, or what
-            else meshio reads.
+        path: .vtu and the other XML files of VTK, .vtk, .msh, .mesh, .xdmf, .npz, .bintet, .ovm, .node or .ele, or
+            another that the manual lists.
         dtype: Floating-point type of vertices, colours and densities. Files of this type round-trip to the bit. None:
             float32, or float64 where rounding to that would flatten or invert a cell.
         split: Split hexahedra, wedges, pyramids and polyhedra into tetrahedra, and straighten cells of higher order.
@@ -180,15 +180,7 @@ def _load(request: Request) -> tuple[MeshData, MeshError | None]:
 
 
 def _read(path: Path, step: int | None) -> Content:
-    if path.is_dir():
-        raise MeshError(f"{path} is a folder; give the mesh file in it.")
-    if not path.is_file():
-        raise MeshError(f"There is no mesh file {path}; check the path.")
-    try:
-        content = format_of(path).content(path, step)
-    except OSError as error:
-        reason = error.strerror or type(error).__name__
-        raise MeshError(f"{path} cannot be read ({reason}); check the disk and the file's permissions.") from error
+    content = read_content(path, step)
     require_array(path, "vertices", content.vertices, 3)
     return replace(content, point_data=_columns(content.point_data), cell_data=_columns(content.cell_data))
 

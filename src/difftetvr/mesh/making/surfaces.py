@@ -12,11 +12,8 @@ Tetrahedral Mesh Generator, 2015.
 
 from __future__ import annotations
 
-import contextlib
-import io
 import math
 import os
-import re
 import subprocess
 import sys
 import tempfile
@@ -31,14 +28,16 @@ import torch
 from numpy.typing import NDArray
 
 from difftetvr.errors import MeshError
+from difftetvr.mesh.io.formats.table import read_content
 from difftetvr.mesh.limits import MAX_CELLS
 from difftetvr.mesh.tetmesh import TetMesh
+from difftetvr.trust import require_regular
 
 Mesher = Literal["ftetwild", "tetgen"]
 Arrays = tuple[NDArray[np.float64], NDArray[np.int32]]
 
 SURFACE_SUFFIXES = (".ply", ".stl", ".obj", ".off", ".msh", ".vtk", ".vtu")
-"""Formats that surfaces are commonly kept in; others that meshio knows are read, too."""
+"""Formats that surfaces are commonly kept in; the other formats of meshes are read, too."""
 
 _PACKAGES = {"ftetwild": ("pytetwild", "fTetWild", "MPL-2.0"), "tetgen": ("tetgen", "TetGen", "AGPL-3.0")}
 _REGULAR_VOLUME = 1.0 / (6.0 * math.sqrt(2.0))
@@ -223,61 +222,23 @@ def load_surface(path: str | Path) -> Arrays:
     Raises:
         MeshError: The file cannot be read, has no triangles, has polygons of more corners, or is no surface.
     """
-    import meshio  # late: it loads every format it knows
-
     path = Path(path)
+    require_regular(path, MeshError)
     if not path.is_file():
         raise MeshError(f"There is no surface file {path}; check the path.")
-    output = io.StringIO()
-    try:
-        require_whole(path)
-        with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output):
-            content = meshio.read(path, file_format="gmsh" if path.suffix.lower() == ".msh" else None)
-    except MemoryError:
-        raise
-    # meshio's readers fail on broken files with whatever their parsers raise, and leave the process where none fits.
-    except (Exception, SystemExit) as error:
-        said = str(error) if isinstance(error, Exception) else output.getvalue()
-        reason = next((line.strip().rstrip(".") for line in said.splitlines() if line.strip()), type(error).__name__)
-        raise MeshError(
-            f"{path} cannot be read as a surface ({reason}); give one of {', '.join(SURFACE_SUFFIXES)}."
-        ) from error
-    blocks = [_triangles(path, block.type, np.asarray(block.data)) for block in content.cells]
+    content = read_content(path)
+    blocks = [_triangles(path, block.kind, np.asarray(block.nodes)) for block in content.cells]
     found = [block for block in blocks if len(block)]
     if not found:
-        types = ", ".join(sorted({block.type for block in content.cells})) or "no cells"
+        types = ", ".join(sorted({block.kind for block in content.cells})) or "no cells"
         raise MeshError(f"{path} has no triangles (found: {types}); give a surface.")
-    points = np.asarray(content.points)
+    points = np.asarray(content.vertices)
     if points.ndim == 2 and points.shape[1] == 2:
         raise MeshError(f"{path} has vertices in two dimensions; give a surface in three.")
     try:
         return as_surface(points, np.concatenate(found))
     except MeshError as error:
         raise MeshError(f"{path}: {error}") from error
-
-
-def require_whole(path: Path) -> None:
-    """Refuse files that were cut off where meshio would wait for the rest forever: it does so in three formats.
-
-    Args:
-        path: Any file; only .ply, .off and .msh are looked into.
-
-    Raises:
-        ValueError: The file lacks its end, or the end of its header.
-    """
-    suffix = path.suffix.lower()
-    if suffix not in (".ply", ".off", ".msh"):
-        return
-    content = path.read_bytes()
-    if suffix == ".ply":
-        whole = b"end_header" in content
-    elif suffix == ".off":
-        whole = len([word for line in content.splitlines() if line[:1] != b"#" for word in line.split()]) > 3
-    else:
-        sections = len(re.findall(rb"\$(?!End)[A-Z]\w+\r?\n", content))
-        whole = 0 < sections == len(re.findall(rb"\$End[A-Z]\w+", content))
-    if not whole:
-        raise ValueError("it is cut off, or another program's format")
 
 
 def _triangles(path: Path, kind: str, cells: NDArray[Any]) -> NDArray[Any]:

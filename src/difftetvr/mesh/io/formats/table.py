@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from difftetvr.errors import MeshError
 from difftetvr.mesh.io.content import Content, Output
-from difftetvr.mesh.io.formats import bintet, gmsh, medit, npz, ovm, tetgen, through_meshio
+from difftetvr.mesh.io.formats import abaqus, bintet, exodus, medit, npz, ovm, tetgen, through_meshio, unsupported
+from difftetvr.mesh.io.formats.gmsh import reading as gmsh_reading
 from difftetvr.mesh.io.formats.vtk import legacy, lists
+from difftetvr.mesh.io.formats.xdmf import reading as xdmf_reading
+from difftetvr.mesh.io.formats.xdmf import writing as xdmf_writing
+from difftetvr.trust import require_regular
 
 
 @dataclass(frozen=True)
@@ -53,13 +56,39 @@ class Format:
 
 
 def format_of(path: Path) -> Format:
-    """The format that a file's suffix names; one that only meshio may know where it is none of ours."""
-    return FORMATS.get(path.suffix.lower(), Format(through_meshio.read))
+    """The format that a file's name ends with; those that meshio reads for us are not in `FORMATS`.
+
+    Raises:
+        MeshError: It is none that is read.
+    """
+    suffix = path.suffix.lower()
+    if suffix in FORMATS:
+        return FORMATS[suffix]
+    if through_meshio.is_known(path):
+        return Format(through_meshio.read)
+    raise unsupported.sentence(path)
 
 
-def _write_xdmf(path: Path, output: Output) -> None:
-    # Late: it loads meshio and so every format that meshio knows.
-    importlib.import_module("difftetvr.mesh.io.formats.xdmf").write(path, output)
+def read_content(path: Path, step: int | None = None) -> Content:
+    """Read a file in any format.
+
+    Args:
+        path: The file.
+        step: Its time step to read; see `Format.content`.
+
+    Raises:
+        MeshError: There is no such file, or it cannot be read.
+    """
+    if path.is_dir():
+        raise MeshError(f"{path} is a folder; give the mesh file in it.")
+    require_regular(path, MeshError)
+    if not path.is_file():
+        raise MeshError(f"There is no mesh file {path}; check the path.")
+    try:
+        return format_of(path).content(path, step)
+    except OSError as error:
+        reason = error.strerror or type(error).__name__
+        raise MeshError(f"{path} cannot be read ({reason}); check the disk and the file's permissions.") from error
 
 
 _VTK_XML = (
@@ -71,14 +100,16 @@ _VTK_XML = (
 FORMATS: dict[str, Format] = {
     ".vtu": Format(lists.read, through_meshio.write, holds_data=True, holds_harmonics=True, has_steps=True),
     ".vtk": Format(legacy.read, through_meshio.write, holds_data=True),
-    ".msh": Format(gmsh.read, through_meshio.write, holds_data=True),
-    ".xdmf": Format(through_meshio.read_xdmf, _write_xdmf, holds_data=True),
-    ".xmf": Format(through_meshio.read_xdmf),
+    ".msh": Format(gmsh_reading.read, through_meshio.write, holds_data=True, has_steps=True),
+    ".xdmf": Format(xdmf_reading.read, xdmf_writing.write, holds_data=True, has_steps=True),
+    ".xmf": Format(xdmf_reading.read, has_steps=True),
     ".npz": Format(npz.read, npz.write, holds_data=True, holds_harmonics=True),
     ".bintet": Format(bintet.read, bintet.write, is_single=True),
     ".ovm": Format(ovm.read, ovm.write),
     ".node": Format(tetgen.read, tetgen.write),
     ".ele": Format(tetgen.read, tetgen.write),
+    **dict.fromkeys(exodus.SUFFIXES, Format(exodus.read, has_steps=True)),
+    ".inp": Format(abaqus.read),
     ".mesh": Format(medit.read, through_meshio.write, holds_field=False),
     **dict.fromkeys(_VTK_XML, Format(lists.read, has_steps=True)),
 }

@@ -1,11 +1,15 @@
-"""Formats that meshio reads and writes for us."""
+"""Formats that meshio reads and writes for us.
+
+Its readers trust their files: some never end where one is cut off, others follow what HDF5 links to. They run in a
+process of their own, and only those that are named here.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import io
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +17,8 @@ import numpy as np
 
 from difftetvr.errors import MeshError
 from difftetvr.mesh.io.content import CellBlock, Content, Output, damaged
+from difftetvr.mesh.io.hdf5 import PlainFile, load_h5py
+from difftetvr.mesh.io.isolation import isolated
 
 _WRITERS: dict[str, tuple[str, dict[str, Any]]] = {
     ".vtu": ("vtu", {"binary": True, "compression": "zlib"}),
@@ -22,33 +28,62 @@ _WRITERS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 """Format name and options of meshio by suffix."""
 
+SURFACES = (".ply", ".stl", ".obj", ".off")
+"""Suffixes of formats that hold surfaces only."""
+
+_HDF5 = (".cgns", ".h5m", ".hmf", ".med")
+
+VOLUMES = (
+    *(".avs", ".bdf", ".dat", ".dato", ".dato.gz", ".f3grid", ".fem", ".mdpa", ".meshb", ".nas"),
+    *(".post", ".post.gz", ".su2", ".tec", ".ugrid", ".vol", ".vol.gz", ".xml"),
+    *_HDF5,
+)
+"""Suffixes of formats that may hold volumes."""
+
+
+_MOST_EMPTY_LINES = 100
+
+
+def is_known(path: Path) -> bool:
+    """Whether a file's suffix is one of those that meshio reads for us."""
+    return path.name.lower().endswith((*SURFACES, *VOLUMES))
+
 
 def read(path: Path) -> Content:
-    """Read a file in any format that meshio knows.
+    """Read a file in a format of `SURFACES` or `VOLUMES`, in a process of its own.
 
     Args:
         path: The file; its suffix names the format.
 
     Raises:
-        MeshError: It cannot be read.
+        MeshError: It cannot be read, or takes too much time or memory.
     """
+    if path.suffix.lower() in _HDF5:
+        load_h5py(path)
+    return isolated(read_here, path)
+
+
+def read_here(path: Path, _: int | None = None) -> Content:
+    """As `read`, in this process, which may never end."""
     import meshio  # late: it loads every format it knows
 
-    return _content(path, lambda: meshio.read(path))
-
-
-def read_xdmf(path: Path) -> Content:
-    """Read an .xdmf file of one grid; its arrays may lie in the file, in binary files beside it, or in HDF5 files.
-
-    Args:
-        path: The file. Arrays in HDF5 need the package h5py.
-
-    Raises:
-        MeshError: It cannot be read.
-    """
-    from difftetvr.mesh.io.formats.xdmf import GuardedReader
-
-    return _content(path, lambda: GuardedReader(path).read())
+    # Many of its readers wait for a line that never comes where a file is cut off.
+    meshio._files.open = _open
+    if path.suffix.lower() in _HDF5:
+        with PlainFile(path) as file:
+            file.require_plain()
+    output = io.StringIO()
+    try:
+        with _quiet(output):
+            content = _converted(meshio.read(path))
+    except (MeshError, MemoryError):
+        raise
+    # meshio's readers fail on broken files with whatever their parsers raise, and leave the process where none fits.
+    except (Exception, SystemExit) as error:
+        raise damaged(path, _reason(error, output.getvalue())) from error
+    if "cannot handle" in output.getvalue() or "corrupt" in output.getvalue():
+        raise damaged(path, _first_line(" ".join(output.getvalue().split())))
+    return content
 
 
 def write(path: Path, output: Output) -> None:
@@ -67,26 +102,38 @@ def write(path: Path, output: Output) -> None:
         content.write(str(path), file_format=file_format, **options)
 
 
-def _content(path: Path, read_mesh: Callable[[], Any]) -> Content:
-    output = io.StringIO()
-    try:
-        with _quiet(output):
-            mesh = read_mesh()
-        content = _converted(mesh)
-    except MeshError:
-        raise
-    except MemoryError as error:
-        raise damaged(path, "it needs more memory than there is") from error
-    # meshio's readers fail on broken files with whatever their parsers raise, and leave the process where none fits.
-    except (Exception, SystemExit) as error:
-        reason = _printed_reason(output.getvalue()) if isinstance(error, SystemExit) else _first_line(error)
-        raise MeshError(
-            f"{path} cannot be read as a mesh ({reason}); check that it is complete and that meshio knows its format "
-            "and compression (zlib or none)."
-        ) from error
-    if "cannot handle" in output.getvalue() or "corrupt" in output.getvalue():
-        raise damaged(path, _first_line(" ".join(output.getvalue().split())))
-    return content
+class _Text(io.TextIOWrapper):
+    """A text that does not give empty lines for ever after its end."""
+
+    empty_lines = 0
+
+    def readline(self, *arguments: Any) -> str:  # type: ignore[override]
+        line = super().readline(*arguments)
+        self.empty_lines += not line
+        if self.empty_lines > _MOST_EMPTY_LINES:
+            raise EOFError("it ends too early")
+        return line
+
+
+class _Binary(io.BufferedReader):
+    """As `_Text`, for lines of bytes."""
+
+    empty_lines = 0
+
+    def readline(self, *arguments: Any) -> bytes:
+        line = super().readline(*arguments)
+        self.empty_lines += not line
+        if self.empty_lines > _MOST_EMPTY_LINES:
+            raise EOFError("it ends too early")
+        return line
+
+
+def _open(path: str, mode: str = "r") -> Any:
+    """What meshio opens files with."""
+    if "r" not in mode or "+" in mode:
+        return open(path, mode)
+    binary = _Binary(io.FileIO(path))
+    return binary if "b" in mode else _Text(binary)
 
 
 def _converted(mesh: Any) -> Content:
@@ -97,7 +144,22 @@ def _converted(mesh: Any) -> Content:
         is_table = isinstance(block.data, np.ndarray) and block.data.ndim == 2
         blocks.append(CellBlock(block.type, block.data if is_table else np.empty((len(rows), 0), np.int64), rows))
     cell_data = {name: np.concatenate(values) for name, values in mesh.cell_data.items()}
-    return Content(np.asarray(mesh.points), tuple(blocks), dict(mesh.point_data), cell_data)
+    return Content(np.asarray(mesh.points), tuple(blocks), dict(mesh.point_data), cell_data, _unused(mesh))
+
+
+def _unused(mesh: Any) -> tuple[str, ...]:
+    """A sentence about what meshio has read and we have no place for."""
+    sets = [*mesh.point_sets, *mesh.cell_sets]
+    return (f"Sets of nodes and cells were left out: {', '.join(map(repr, sets[:8]))}.",) if sets else ()
+
+
+def _reason(error: BaseException, printed: str) -> str:
+    """What is wrong, of what meshio raised or printed; nothing of what only its authors understand."""
+    if isinstance(error, SystemExit):
+        return _printed_reason(printed)
+    if isinstance(error, (AssertionError, AttributeError, LookupError, NameError, TypeError)):
+        return "meshio's reader does not understand it"
+    return _first_line(error)
 
 
 def _first_line(message: object) -> str:

@@ -1,0 +1,7 @@
+from . import data as data
+from . import elements as elements
+from . import entities as entities
+from . import nodes as nodes
+from . import reading as reading
+
+__all__: list[str] = []
