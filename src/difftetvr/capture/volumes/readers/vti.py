@@ -20,8 +20,9 @@ import numpy as np
 from difftetvr.capture.volumes.volume_file import (
     RawVolume,
     byte_count,
+    parse_numbers,
     parse_shape,
-    parse_spacing,
+    parse_steps,
     text_to_volume,
     to_volume,
 )
@@ -83,17 +84,29 @@ def read_vti(path: Path) -> RawVolume:
     if len(limits) != 6:
         raise CaptureError(f"'{path}' has no valid Extent; get the file anew.")
     shape = parse_shape([limits[2 * axis + 1] - limits[2 * axis] + 1 for axis in range(3)], path)
-    spacing = parse_spacing((image.get("Spacing") or "1 1 1").split(), path)
-    array = _point_array(path, pieces[0])
+    spacing, directions = parse_steps(_steps(image), path)
+    array, note = _point_array(path, pieces[0])
     code = _TYPES.get(array.get("type", ""))
     if code is None:
         raise CaptureError(f"'{path}' has values of type '{array.get('type')}'; give integers or floats.")
     layout = _layout(path, root, appended)
     dtype = np.dtype(layout.order + code)
-    count = byte_count(shape, dtype, path)
+    count = byte_count(shape, dtype)
     if array.get("format") == "ascii":
-        return RawVolume(text_to_volume(array.text or "", shape, dtype, path), spacing)
-    return RawVolume(to_volume(_array_bytes(layout, array, count), shape, dtype, path), spacing)
+        values = text_to_volume(array.text or "", shape, dtype, path)
+    else:
+        values = to_volume(_array_bytes(layout, array, count), shape, dtype, path)
+    return RawVolume(values, spacing, directions, note)
+
+
+def _steps(image: ElementTree.Element) -> list[list[float]]:
+    """From a sample to the next along each axis in the world; an empty list where the image does not tell."""
+    spacing = parse_numbers((image.get("Spacing") or "1 1 1").split())
+    # Row by row; the columns are the axes.
+    matrix = parse_numbers((image.get("Direction") or "1 0 0 0 1 0 0 0 1").split())
+    if len(spacing) != 3 or len(matrix) != 9:
+        return []
+    return [[spacing[axis] * matrix[axis + 3 * row] for row in range(3)] for axis in range(3)]
 
 
 def _parse(path: Path) -> tuple[ElementTree.Element, bytes]:
@@ -126,14 +139,20 @@ def _layout(path: Path, root: ElementTree.Element, appended: bytes) -> _Layout:
     return _Layout(path, order, header, _COMPRESSORS[compressor] if compressor else None, appended, encoding)
 
 
-def _point_array(path: Path, piece: ElementTree.Element) -> ElementTree.Element:
+def _point_array(path: Path, piece: ElementTree.Element) -> tuple[ElementTree.Element, tuple[str, ...]]:
+    """The array to show, with a note on those that are not."""
     data = piece.find("PointData")
     arrays = [] if data is None else data.findall("DataArray")
     scalars = [a for a in arrays if (a.get("NumberOfComponents") or "1").strip() in ("1", "0")]
     if data is None or not scalars:
         raise CaptureError(f"'{path}' has no point array with one component; give a scalar volume.")
     active = [a for a in scalars if a.get("Name") == data.get("Scalars")]
-    return (active or scalars)[0]
+    taken = (active or scalars)[0]
+    if len(scalars) == 1:
+        return taken, ()
+    others = ", ".join(repr(array.get("Name")) for array in scalars if array is not taken)
+    why = "its active one" if active else "its first one"
+    return taken, (f"Of the scalars in '{path}', {taken.get('Name')!r} is read, {why}; passed over: {others}.",)
 
 
 def _array_bytes(layout: _Layout, array: ElementTree.Element, count: int) -> bytes:
