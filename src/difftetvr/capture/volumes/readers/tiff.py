@@ -5,6 +5,7 @@ Sources: TIFF 6.0; https://imagej.net/formats/tiff and https://ome-model.readthe
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 import xml.etree.ElementTree as ElementTree
@@ -21,6 +22,7 @@ from difftetvr.capture.volumes.volume_file import RawVolume, parse_numbers
 from difftetvr.errors import CaptureError
 from difftetvr.trust import file_beside, require_modest
 
+_LOG = logging.getLogger("tifffile")
 SUFFIXES = (".tif", ".tiff")
 # What photographs with cameras have beside or above their images.
 _OF_PHOTOGRAPHS = re.compile(r"(transforms.*|cameras)\.json|(cameras|images|points3D)\.(bin|txt)|sparse", re.IGNORECASE)
@@ -37,16 +39,17 @@ def read_tiff(path: Path) -> RawVolume:
     Raises:
         CaptureError: The file is damaged, holds colours or one page only, or tifffile is missing.
     """
-    with _opened(path) as tiff:
+    with _opened(path) as (tiff, faults):
         pages = _pages(path, tiff)
         count, spacing = _stack_of(path, tiff, len(pages))
         if count < 2:
             raise CaptureError(f"'{path}' holds a single slice; give a stack of them, or the folder with all slices.")
         if count > len(pages):
-            return RawVolume(_one_behind_the_other(path, pages[0], count, tiff.byteorder), spacing)
-        size = sum(page.nbytes for page in pages)
-        require_modest(path, size, "slices", CaptureError)
-        return RawVolume(np.stack([_samples(path, page) for page in pages]), spacing)
+            values = _one_behind_the_other(path, pages[0], count, tiff.byteorder)
+        else:
+            require_modest(path, sum(page.nbytes for page in pages), "slices", CaptureError)
+            values = np.stack([_samples(path, page) for page in pages])
+    return RawVolume(values, spacing, notes=faults.notes(path))
 
 
 def read_slices(path: Path) -> RawVolume:
@@ -56,10 +59,11 @@ def read_slices(path: Path) -> RawVolume:
         CaptureError: A file is damaged, or of another size or type than the first.
     """
     layers: list[np.ndarray] = []
+    notes: tuple[str, ...] = ()
     files = _slices(path)
     for name in files:
         file = file_beside(path, name, CaptureError)
-        with _opened(file) as tiff:
+        with _opened(file) as (tiff, faults):
             pages = _pages(file, tiff)
             if len(pages) != 1:
                 raise CaptureError(f"'{file}' holds {len(pages)} pages; give a folder of single slices, or one stack.")
@@ -69,7 +73,8 @@ def read_slices(path: Path) -> RawVolume:
             layers.append(_samples(file, pages[0]))
         if (layers[-1].shape, layers[-1].dtype) != (layers[0].shape, layers[0].dtype):
             raise CaptureError(f"'{file}' has another size or type than '{files[0]}'; give slices that are alike.")
-    return RawVolume(np.stack(layers), (1.0, 1.0, 1.0))
+        notes = notes or faults.notes(file)
+    return RawVolume(np.stack(layers), (1.0, 1.0, 1.0), notes=notes)
 
 
 def _slices(path: Path) -> list[str]:
@@ -86,18 +91,38 @@ def _entries(path: Path) -> list[str]:
 
 
 def _in_order(name: str) -> list[tuple[int, str]]:
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d{1,18})", name)]
+    # Every other part is a number.
+    parts = enumerate(re.split(r"(\d{1,18})", name))
+    return [(int(part), "") if index % 2 else (-1, part) for index, part in parts]
+
+
+class _Faults(logging.Handler):
+    """Hears what tifffile finds wrong with a file and passes over."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.ERROR)
+        self.count = 0
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Counts a message, which speaks of the inside of files too closely to be printed."""
+        self.count += 1
+
+    def notes(self, path: Path) -> tuple[str, ...]:
+        """A sentence where there was anything."""
+        return (f"Parts of '{path}' are damaged and were passed over; samples may be missing.",) if self.count else ()
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Any]:
+def _opened(path: Path) -> Iterator[tuple[Any, _Faults]]:
     tifffile = package("tifffile", path)
     file_size(path)
+    faults = _Faults()
+    _LOG.addHandler(faults)
     try:
         # Taken for OME's, a file could lead to others.
         with tifffile.TiffFile(path, is_ome=False) as tiff:
-            yield tiff
-    except CaptureError:
+            yield tiff, faults
+    except (CaptureError, MemoryError):
         raise
     except Exception as error:
         if "imagecodecs" in str(error):
@@ -107,13 +132,22 @@ def _opened(path: Path) -> Iterator[Any]:
             ) from error
         # What damaged files raise is for tifffile, zlib and numpy to decide, and no list of it is complete.
         raise CaptureError(f"'{path}' is no intact TIFF file; get the file anew.") from error
+    finally:
+        _LOG.removeHandler(faults)
 
 
 def _pages(path: Path, tiff: Any) -> list[Any]:
     """The pages that are slices, checked to be alike and as large as they say."""
-    pages = [page for page in tiff.pages if not page.is_reduced and not page.is_mask]
+    pages: list[Any] = []
+    seen: set[int] = set()
     size = file_size(path)
-    for page in pages:
+    for page in tiff.pages:
+        if page.offset in seen:
+            raise CaptureError(f"'{path}' is damaged: its pages lead in a circle; get the file anew.")
+        seen.add(page.offset)
+        if page.is_reduced or page.is_mask:
+            continue
+        pages.append(page)
         if page.samplesperpixel != 1 or page.ndim != 2 or page.dtype is None or page.dtype.kind not in "buif":
             raise CaptureError(f"'{path}' holds pictures with colours, or no numbers; give slices of one channel.")
         if (page.shape, page.dtype) != (pages[0].shape, pages[0].dtype):
