@@ -1,4 +1,4 @@
-"""Every error a user can cause: one sentence that says what is wrong, where, and what to do; and how it counts."""
+"""Every error a user can cause: one sentence that says what is wrong, where, and what to do; warnings; and counts."""
 
 from __future__ import annotations
 
@@ -13,6 +13,10 @@ class MeshError(DiffTetError):
 
 class CaptureError(DiffTetError):
     """Images, cameras, volumes or transfer functions that a reconstruction starts from are invalid."""
+
+
+class CaptureWarning(UserWarning):
+    """Something about a capture that was passed over, chosen or changed, and that its owner should know."""
 
 
 class CameraError(DiffTetError):

@@ -67,7 +67,8 @@ class Info:
     """Describe a mesh or a capture."""
 
     file: Annotated[str, Positional, arg(metavar="FILE")]
-    """A mesh (.vtu, .vtk, .msh, .mesh, .xdmf, .npz, .bintet, .ovm, .node), a volume, a capture (.npz), or tooth."""
+    """A mesh (.vtu, .vtk, .msh, .mesh, .xdmf, .npz, .bintet, .ovm, .node), a volume, a capture (.npz), or tooth.
+    A volume's values are described without a --transfer-function, its views with one."""
     reading: OmitArgPrefixes[MeshOptions] = field(default_factory=MeshOptions)
     views_of: OmitArgPrefixes[CaptureOptions] = field(default_factory=CaptureOptions)
     trust: OmitArgPrefixes[TrustOptions] = field(default_factory=TrustOptions)
@@ -75,9 +76,13 @@ class Info:
 
     def run(self, console: Console) -> None:
         """Prints tables."""
-        from difftetvr.view.describe import capture_table, data_table, mesh_tables
+        from difftetvr.capture.volumes.volume import is_volume_file
+        from difftetvr.view.describe import capture_table, data_table, mesh_tables, volume_table
 
         path = Path(self.file)
+        if is_volume_file(path) and self.views_of.transfer_function is None:
+            console.print(volume_table(self.file, self.views_of.summarise(self.file, console)))
+            return
         if _is_capture(path):
             console.print(capture_table(self.file, self.views_of.load(self.file, console)))
             return

@@ -8,7 +8,7 @@ import math
 import types
 import typing
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from difftetvr.capture.capture import Capture
+    from difftetvr.capture.volumes.summary import VolumeSummary
     from difftetvr.mesh.field import Field
     from difftetvr.mesh.io import MeshData
     from difftetvr.mesh.tetmesh import TetMesh
@@ -51,7 +52,7 @@ TRUST_GROUPS: Groups = {"How far files are trusted": ("allow-outside", "allow-la
 CAPTURE_GROUPS: Groups = {
     "How photographs are read": ("downscale", "format", "bounds", "test-every"),
     "How a volume is read and seen": (
-        *("transfer-function", "shape", "dtype", "spacing", "attenuation"),
+        *("transfer-function", "shape", "dtype", "spacing", "value-range", "attenuation"),
         *("views", "width", "height", "radius", "orbit"),
     ),
     **TRUST_GROUPS,
@@ -90,6 +91,9 @@ class CaptureOptions:
     """NumPy type of a .raw volume without a header, such as uint8."""
     spacing: tuple[float, float, float] | None = None
     """Distances of samples along x, y and z; default: the file's."""
+    value_range: tuple[float, float] | None = None
+    """Values that stand for 0 and 1 of the transfer function; default: 0 and 255 for uint8, else the least and the
+    greatest one."""
     attenuation: float | None = None
     """Density of opacity 1, where the box's longest side is 1."""
     views: int | None = None
@@ -130,15 +134,29 @@ class CaptureOptions:
 
     def load(self, name: str, console: Console) -> Capture:
         """Reads or renders the capture of that name."""
-        from difftetvr.capture import CaptureWarning, load_capture
+        from difftetvr.capture import load_capture
 
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always", CaptureWarning)
-            with waiting(console, f"Preparing the views of {name}"):
-                capture = load_capture(name, **dataclasses.asdict(self))
-        for warning in caught:
-            console.print(str(warning.message), highlight=False)
-        return capture
+        with _saying(console), waiting(console, f"Preparing the views of {name}"):
+            return load_capture(name, **dataclasses.asdict(self))
+
+    def summarise(self, name: str, console: Console) -> VolumeSummary:
+        """Reads the volume of that name without rendering it."""
+        from difftetvr.capture.volumes.summary import summarise
+
+        with _saying(console), waiting(console, f"Reading {name}"):
+            return summarise(name, self.shape, self.dtype, self.spacing, self.value_range)
+
+
+@contextlib.contextmanager
+def _saying(console: Console) -> Iterator[None]:
+    """Context in which warnings about captures are lines of the output, once it ends well."""
+    from difftetvr.capture import CaptureWarning
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", CaptureWarning)
+        yield
+    for warning in caught:
+        console.print(str(warning.message), highlight=False)
 
 
 @dataclass(frozen=True)

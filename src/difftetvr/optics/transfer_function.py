@@ -14,6 +14,7 @@ import torch
 
 from difftetvr.errors import CaptureError
 from difftetvr.files import atomic_write
+from difftetvr.trust import require_regular
 
 Values = TypeVar("Values", np.ndarray, torch.Tensor)
 
@@ -142,7 +143,7 @@ class TransferFunction:
         """
         try:
             content = json.loads(_read(path))
-        except ValueError:
+        except (ValueError, RecursionError):
             raise CaptureError(f"The transfer function '{path}' is not valid JSON; {_HINT}.") from None
         content = content if isinstance(content, dict) else {}
         missing = [key for key in ("scalar", "opacity") if key not in content]
@@ -154,11 +155,13 @@ class TransferFunction:
         lists = []
         for key in ("scalar", "opacity", "color"):
             try:
-                lists.append(torch.tensor(np.array(content[key], dtype=np.float32)))
-            except (ValueError, TypeError, OverflowError):
+                with np.errstate(over="ignore"):  # The infinity that a number over 3e38 becomes is told below.
+                    lists.append(torch.tensor(np.array(content[key], dtype=np.float32)))
+            except (ValueError, TypeError, OverflowError, RecursionError):
                 raise CaptureError(f"'{key}' in the transfer function '{path}' is not a list of numbers.") from None
         scalar, opacity, color = lists
-        return TransferFunction(scalar, opacity, color, str(content.get("name", path)))
+        name = content.get("name")
+        return TransferFunction(scalar, opacity, color, name if isinstance(name, str) else str(path))
 
     @staticmethod
     def from_xml(path: str | Path) -> TransferFunction:
@@ -206,6 +209,7 @@ class TransferFunction:
 
 
 def _read(path: str | Path) -> str:
+    require_regular(Path(path), CaptureError)
     try:
         return Path(path).read_text(encoding="utf-8")
     except UnicodeDecodeError:

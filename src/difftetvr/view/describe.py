@@ -12,6 +12,8 @@ from rich.table import Table
 from rich.text import Text
 
 from difftetvr.capture.capture import Capture
+from difftetvr.capture.volumes.summary import VolumeSummary
+from difftetvr.capture.volumes.value_range import range_text
 from difftetvr.fitting.records.evaluation import Evaluation
 from difftetvr.mesh.field import Field
 from difftetvr.mesh.frame import WORLD
@@ -149,6 +151,23 @@ def capture_table(name: str, capture: Capture) -> Table:
     if capture.valid is not None:
         table.add_row("masked", f"{100.0 * float((~capture.valid).float().mean()):.1f} % of the pixels")
     table.add_row("density unit", f"{capture.density_unit:g} per unit length")
+    return table
+
+
+def volume_table(name: str, summary: VolumeSummary) -> Table:
+    """Resolution, spacing and values of a volume."""
+    table = _table(name)
+    table.add_row("resolution", " x ".join(str(n) for n in summary.resolution))
+    table.add_row("spacing", " x ".join(f"{s:.4g}" for s in summary.spacing))
+    missing = f", {summary.missing:,} not finite" if summary.missing else ""
+    ends = "none is finite" if summary.ends is None else range_text(summary.ends)
+    table.add_row("values", f"{summary.dtype}, {ends}{missing}")
+    for share, value in summary.quantiles.items():
+        table.add_row(f"{100 * share:g} % below", f"{value:.6g}")
+    if summary.value_range is None:
+        table.add_row("0 to 1", "nothing: all values are the same")
+    else:
+        table.add_row("0 to 1", f"values {range_text(summary.value_range)}; --value-range says otherwise")
     return table
 
 

@@ -19,6 +19,7 @@ from difftetvr.capture.photos.readers.camera_list import CAMERAS_FORMAT, read_ca
 from difftetvr.capture.photos.readers.colmap import find_colmap_model, read_colmap
 from difftetvr.capture.photos.readers.tiny_nerf import is_tiny_nerf, read_tiny_nerf
 from difftetvr.capture.photos.readers.transforms import read_nerf_synthetic, read_transforms
+from difftetvr.capture.volumes.readers.table import is_volume_file
 from difftetvr.errors import CaptureError
 from difftetvr.rendering.cameras.pinhole import Camera
 
@@ -178,10 +179,15 @@ class PhotoCapture:
 
 
 def is_photo_source(source: str | Path) -> bool:
-    """Whether something can only be a photo capture: a folder, a ``.json`` file or a tiny NeRF archive."""
+    """Whether something can only be a photo capture: a folder, a ``.json`` file or a tiny NeRF archive.
+
+    A folder of ``.tif`` slices is a volume instead.
+    """
     path = Path(source)
     suffix = path.suffix.lower()
-    return path.is_dir() or (path.is_file() and (suffix == ".json" or (suffix == ".npz" and is_tiny_nerf(path))))
+    if path.is_dir():
+        return not is_volume_file(path)
+    return path.is_file() and (suffix == ".json" or (suffix == ".npz" and is_tiny_nerf(path)))
 
 
 def find_format(path: Path) -> PhotoFormat:

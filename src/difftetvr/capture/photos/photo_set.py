@@ -13,10 +13,7 @@ import numpy as np
 from difftetvr.capture.photos.image_file import SUFFIXES
 from difftetvr.capture.photos.lens import Lens
 from difftetvr.errors import CaptureError
-
-
-class CaptureWarning(UserWarning):
-    """Something about a capture that was passed over and that its owner should know."""
+from difftetvr.errors import CaptureWarning as CaptureWarning
 
 
 @dataclass(frozen=True, eq=False)

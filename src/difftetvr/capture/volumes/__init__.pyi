@@ -1,4 +1,8 @@
+from . import orientation as orientation
 from . import readers as readers
+from . import stored as stored
+from . import summary as summary
+from . import value_range as value_range
 from . import volume as volume
 from . import volume_capture as volume_capture
 from . import volume_file as volume_file

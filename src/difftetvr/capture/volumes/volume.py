@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,11 +11,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from difftetvr.capture.volumes.readers.nrrd import read_nrrd
-from difftetvr.capture.volumes.readers.raw import read_raw
-from difftetvr.capture.volumes.readers.vti import read_vti
+from difftetvr.capture.volumes.orientation import in_world_axes
+from difftetvr.capture.volumes.readers.table import is_volume_file as is_volume_file
+from difftetvr.capture.volumes.readers.table import read_volume
+from difftetvr.capture.volumes.value_range import normalise
 from difftetvr.capture.volumes.volume_file import RawVolume
-from difftetvr.errors import CaptureError
+from difftetvr.errors import CaptureError, CaptureWarning
 
 # Samples are indexed with 32 bits in records of four values.
 MAX_SAMPLES = 2**30
@@ -31,6 +33,7 @@ class Volume:
         values: (nz, ny, nx) float32 scalars, x fastest; in [0, 1] when the volume was loaded from a file.
         spacing: Distance of neighbouring samples along (x, y, z), in any unit, > 0.
         name: What to call it, for messages.
+        value_range: What the file held where the scalars are 0 and 1.
 
     Raises:
         CaptureError: An axis has fewer than two samples, a value is not finite, or the spacing is not positive.
@@ -39,6 +42,7 @@ class Volume:
     values: np.ndarray
     spacing: tuple[float, float, float] = (1.0, 1.0, 1.0)
     name: str = "volume"
+    value_range: tuple[float, float] = (0.0, 1.0)
 
     def __post_init__(self) -> None:
         values = np.ascontiguousarray(self.values, dtype=np.float32)
@@ -80,55 +84,50 @@ class Volume:
         shape: Sequence[int] | None = None,
         dtype: str | None = None,
         spacing: Sequence[float] | None = None,
+        value_range: Sequence[float] | None = None,
     ) -> Volume:
-        """Read a volume and normalise its values to [0, 1].
+        """Read a volume, turn it to the world's axes and map its values to [0, 1].
 
-        Unsigned integers are divided by the largest value of their type (255, 65535, ...); signed integers and floats
-        are mapped linearly from their smallest and largest value.
+        Exchanged and reversed axes of a file are put right, so that x, y and z are the world's as the file defines
+        these ("Volumes in" in the manual).
 
         Args:
-            path: ``.raw`` (also ``.raw.gz``, ``.raw.xz``), ``.dat``, ``.nrrd``, ``.nhdr`` or ``.vti``. What a ``.raw``
-                file holds is taken from ``shape`` and ``dtype``, else from a ``.dat`` header of the same name beside
-                it, else from its name, as in ``tooth_103x94x161_uint8.raw``.
+            path: ``.raw`` (also ``.raw.gz``, ``.raw.xz``), ``.dat``, ``.nrrd``, ``.nhdr``, ``.vti``, ``.mha``, ``.mhd``
+                or ``.npy``, and with the extra ``volumes`` ``.nii``, ``.nii.gz``, ``.tif``, ``.tiff`` or a folder of
+                ``.tif`` slices. What a ``.raw`` file holds is taken from ``shape`` and ``dtype``, else from a ``.dat``
+                header of the same name beside it, else from its name, as in ``tooth_103x94x161_uint8.raw``.
             shape: (nx, ny, nz) of a ``.raw`` file, x fastest.
             dtype: NumPy name of a ``.raw`` file's values, e.g. ``uint8``, ``uint16``, ``>u2``, ``float32``.
-            spacing: Distances of samples along (x, y, z); overrides the file's.
+            spacing: Distances of samples along (x, y, z) of the world; overrides the file's.
+            value_range: Values that stand for 0 and 1; others are clamped. None: 0 and 255 for uint8, and for all other
+                types the least and the greatest value.
 
         Raises:
-            CaptureError: The file is missing, damaged, of another size than described, or of an unknown kind.
+            CaptureError: The file is missing, damaged, of another size than described, or of an unknown kind, or its
+                values have no range.
+
+        Warns:
+            CaptureWarning: The range was taken from the values, values are clamped or not a number, or a reader had to
+                choose; once for each.
         """
-        raw = _read(Path(path), shape, dtype)
+        try:
+            raw = load_raw(path, shape, dtype)
+            scalars, ends, notes = normalise(raw.values, value_range, path)
+        except MemoryError as error:
+            raise CaptureError(f"The volume '{path}' needs more memory than there is; crop or shrink it.") from error
+        for note in (*raw.notes, *notes):
+            warnings.warn(note, CaptureWarning, stacklevel=2)
         chosen = raw.spacing if spacing is None else tuple(float(s) for s in spacing)
-        return Volume(_normalise(raw.values, path), chosen, Path(path).name)  # type: ignore[arg-type]
+        return Volume(scalars, chosen, Path(path).name, ends)  # type: ignore[arg-type]
 
 
-def is_volume_file(path: str | Path) -> bool:
-    """Whether a file's name says that it holds a volume that `Volume.load` reads."""
-    name = Path(path).name.lower()
-    return name.endswith((".raw", ".raw.gz", ".raw.xz", ".dat", ".nrrd", ".nhdr", ".vti"))
+def load_raw(path: str | Path, shape: Sequence[int] | None, dtype: str | None) -> RawVolume:
+    """A volume's values as its file stores them, in the order of the world's axes; arguments as for `Volume.load`.
 
-
-def _read(path: Path, shape: Sequence[int] | None, dtype: str | None) -> RawVolume:
-    name = path.name.lower()
-    if not is_volume_file(path):
-        raise CaptureError(f"'{path}' is no volume that can be read; give a .raw, .dat, .nrrd, .nhdr or .vti file.")
-    if path.is_dir():
-        raise CaptureError(f"'{path}' is a folder; give the volume file in it.")
-    if not path.is_file():
-        raise CaptureError(f"There is no file '{path}'; check the path of the volume.")
-    if name.endswith((".raw", ".raw.gz", ".raw.xz", ".dat")):
-        return read_raw(path, shape, dtype)
-    if shape is not None or dtype is not None:
-        raise CaptureError(f"'{path}' says itself what it holds; leave out the shape and the dtype.")
-    return read_vti(path) if name.endswith(".vti") else read_nrrd(path)
-
-
-def _normalise(values: np.ndarray, path: str | Path) -> np.ndarray:
-    if values.dtype.kind == "u":
-        return (values / np.float32(np.iinfo(values.dtype).max)).astype(np.float32)
-    if not np.isfinite(values).all():
-        raise CaptureError(f"The volume '{path}' holds values that are not finite; replace them first.")
-    lower, upper = float(values.min()), float(values.max())
-    if not lower < upper:
-        raise CaptureError(f"All values of the volume '{path}' are {lower}; there is no range to normalise.")
-    return ((values.astype(np.float64) - lower) / (upper - lower)).astype(np.float32)
+    Raises:
+        CaptureError: As for `Volume.load`.
+    """
+    raw = in_world_axes(read_volume(Path(path), shape, dtype), path)
+    if raw.values.size > MAX_SAMPLES:
+        raise CaptureError(f"'{path}' has {raw.values.size} samples, more than {MAX_SAMPLES}; crop or shrink it.")
+    return raw

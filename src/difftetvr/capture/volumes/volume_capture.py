@@ -13,6 +13,7 @@ import torch
 
 from difftetvr.capture.capture import Capture
 from difftetvr.capture.orbit import DEFAULT_FOV_Y, fibonacci_orbit, random_orbit
+from difftetvr.capture.volumes.value_range import range_text
 from difftetvr.capture.volumes.volume import Volume
 from difftetvr.capture.volumes.volume_renderer import Progress, VolumeRenderer
 from difftetvr.errors import CameraError, CaptureError
@@ -22,6 +23,8 @@ from difftetvr.rendering.cameras.pinhole import Camera
 TOOTH = "tooth"
 _TOOTH_VOLUME = "tooth_103x94x161_uint8.raw.xz"
 _TOOTH_TRANSFER_FUNCTION = "tooth3gauss.json"
+# What would be stored as 0 in every picture of 8 bits.
+_LEAST_SEEN = 0.5 / 255.0
 
 
 @dataclass(frozen=True)
@@ -45,6 +48,8 @@ class VolumeCapture:
         test_offset: Index of the first held-out view.
         seed: Seed of a random orbit.
         orbit: Whether the cameras lie on a Fibonacci spiral or at random places of the sphere.
+        value_range: Values that stand for 0 and 1 of the transfer function; None: 0 and 255 for uint8, else the least
+            and the greatest one.
     """
 
     path: str = TOOTH
@@ -63,6 +68,7 @@ class VolumeCapture:
     test_offset: int = 2
     seed: int = 0
     orbit: Literal["fibonacci", "random"] = "fibonacci"
+    value_range: tuple[float, float] | None = None
 
     def build(self, progress: Progress | None = None, device: str | torch.device | None = None) -> Capture:
         """Read the volume, place the cameras and render the views.
@@ -72,7 +78,7 @@ class VolumeCapture:
             device: PyTorch device to render on; None takes the fastest. The images are on the CPU in any case.
 
         Raises:
-            CaptureError: A file or a value is not valid.
+            CaptureError: A file or a value is not valid, or all views are black.
             BackendError: No back end works on the device.
         """
         test = self._test_mask()
@@ -82,6 +88,12 @@ class VolumeCapture:
             raise CaptureError(f"The attenuation is {self.attenuation}; it must be greater than 0.")
         renderer = VolumeRenderer(volume, transfer_function, self.attenuation, self.steps_per_unit, device)
         images, alphas = renderer.render(cameras, progress)
+        if float(images.max()) < _LEAST_SEEN:
+            raise CaptureError(
+                f"All views of '{self.path}' are black: the transfer function '{transfer_function.name}' shows nothing "
+                f"of it where values {range_text(volume.value_range)} stand for 0 to 1; change the one, the other "
+                "(value_range, --value-range) or the attenuation."
+            )
         name = self.path if self.path == TOOTH else Path(self.path).name.split(".")[0]
         return Capture(cameras, images, alphas, test, volume.bounds, name, self.attenuation)
 
@@ -95,11 +107,11 @@ class VolumeCapture:
             if self.shape is not None or self.dtype is not None:
                 raise CaptureError("The packaged tooth says itself what it holds; leave out the shape and the dtype.")
             with _packaged(_TOOTH_VOLUME) as volume_file, _packaged(_TOOTH_TRANSFER_FUNCTION) as function_file:
-                volume = Volume.load(volume_file, spacing=self.spacing)
+                volume = Volume.load(volume_file, None, None, self.spacing, self.value_range)
                 return volume, TransferFunction.load(self.transfer_function or function_file)
         if self.transfer_function is None:
             raise CaptureError(f"The volume '{self.path}' needs a transfer function; give one as .json or .xml.")
-        volume = Volume.load(self.path, self.shape, self.dtype, self.spacing)
+        volume = Volume.load(self.path, self.shape, self.dtype, self.spacing, self.value_range)
         return volume, TransferFunction.load(self.transfer_function)
 
     def cameras(self) -> list[Camera]:

@@ -1,12 +1,9 @@
-"""What the readers of volume files share: the values as stored, and checks against sizes that do not add up."""
+"""What the readers of volume files share: the values as stored, and checks of what headers and files say."""
 
 from __future__ import annotations
 
-import gzip
-import lzma
 import math
-import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,14 +11,26 @@ import numpy as np
 
 from difftetvr.errors import CaptureError
 
-_MAX_BYTES = 2**36
+_SHORTEST_PRINTED = 60
+# Bytes of text that are parsed at once: as Python objects, numbers take ten times the room.
+_TEXT_BLOCK = 2**22
 
 
 class RawVolume(NamedTuple):
-    """A volume as a file stores it: (nz, ny, nx) values of any number type and spacing along (x, y, z)."""
+    """A volume as a file stores it.
+
+    Attributes:
+        values: (nz, ny, nx) values of any number type; x, y and z are the file's axes, x the fastest.
+        spacing: Distance of neighbouring samples along (x, y, z), > 0.
+        directions: (3, 3) float64, row a is the unit vector in a right-handed world along which the file's axis a
+            (0 for x) runs; None where the file's axes are the world's.
+        notes: What a reader chose or passed over, a sentence each.
+    """
 
     values: np.ndarray
     spacing: tuple[float, float, float]
+    directions: np.ndarray | None = None
+    notes: tuple[str, ...] = ()
 
 
 def parse_shape(numbers: Sequence[int | str], source: str | Path) -> tuple[int, int, int]:
@@ -35,8 +44,9 @@ def parse_shape(numbers: Sequence[int | str], source: str | Path) -> tuple[int, 
     except ValueError:
         shape = ()
     if len(shape) != 3 or min(shape) < 1:
-        given = " ".join(str(n) for n in numbers)
-        raise CaptureError(f"'{source}' gives the resolution '{given}'; it needs three positive whole numbers.")
+        raise CaptureError(
+            f"'{source}' gives the resolution '{_joined(numbers)}'; it needs three positive whole numbers."
+        )
     return shape
 
 
@@ -46,14 +56,40 @@ def parse_spacing(numbers: Sequence[float | str], source: str | Path) -> tuple[f
     Raises:
         CaptureError: They are not.
     """
-    try:
-        spacing = tuple(float(n) for n in numbers)
-    except ValueError:
-        spacing = ()
+    spacing = parse_numbers(numbers)
     if len(spacing) != 3 or not all(math.isfinite(s) and s > 0 for s in spacing):
-        given = " ".join(str(n) for n in numbers)
-        raise CaptureError(f"'{source}' gives the sample distances '{given}'; it needs three positive numbers.")
-    return spacing
+        raise CaptureError(
+            f"'{source}' gives the sample distances '{_joined(numbers)}'; it needs three positive numbers."
+        )
+    return spacing[0], spacing[1], spacing[2]
+
+
+def parse_steps(steps: Sequence[Sequence[float]], source: str | Path) -> tuple[tuple[float, float, float], np.ndarray]:
+    """Spacing and directions of a grid.
+
+    Args:
+        steps: For each of the file's axes x, y, z the vector in the world from a sample to the next.
+        source: The file, for the sentence.
+
+    Returns:
+        ``spacing`` and ``directions`` of a `RawVolume`.
+
+    Raises:
+        CaptureError: They are not three vectors of three finite numbers that differ from 0.
+    """
+    lengths = [math.hypot(*step) for step in steps]
+    if [len(step) for step in steps] != [3, 3, 3] or not all(math.isfinite(n) and n > 0 for n in lengths):
+        given = _joined([f"({_joined(step)})" for step in steps])
+        raise CaptureError(f"'{source}' gives the axes '{given}'; it needs three vectors that differ from 0.")
+    return (lengths[0], lengths[1], lengths[2]), np.array(steps, dtype=np.float64) / np.array(lengths)[:, None]
+
+
+def parse_numbers(words: Sequence[float | str]) -> list[float]:
+    """Floats; an empty list where one of the words is no number."""
+    try:
+        return [float(word) for word in words]
+    except (ValueError, OverflowError):
+        return []
 
 
 def parse_dtype(name: str, source: str | Path) -> np.dtype:
@@ -66,50 +102,14 @@ def parse_dtype(name: str, source: str | Path) -> np.dtype:
         dtype = np.dtype(name)
     except (TypeError, ValueError, SyntaxError):
         dtype = np.dtype(object)
-    if dtype.kind not in "uif":
+    if dtype.kind not in "uif" or dtype.itemsize > 8:
         raise CaptureError(f"'{name}' for '{source}' is no number type; use uint8, uint16, int16, float32 or float64.")
     return dtype
 
 
-def byte_count(shape: tuple[int, int, int], dtype: np.dtype, source: str | Path) -> int:
-    """Bytes that a volume occupies.
-
-    Raises:
-        CaptureError: More than any volume that can be rendered.
-    """
-    count = math.prod(shape) * dtype.itemsize
-    if count > _MAX_BYTES:
-        size = " x ".join(str(n) for n in shape)
-        raise CaptureError(f"'{source}' claims {size} samples, too many to render; crop the volume or check the file.")
-    return count
-
-
-def read_stream(path: Path, encoding: str, start: int, count: int) -> bytes:
-    """Read ``count`` decoded bytes, or up to one more, so that the caller can tell a file that is too long.
-
-    Args:
-        path: File to read.
-        encoding: ``raw``, ``gzip`` or ``xz``.
-        start: Encoded bytes to leave out at the beginning.
-        count: Decoded bytes that are expected.
-
-    Raises:
-        CaptureError: The file cannot be read or decoded.
-    """
-    try:
-        with path.open("rb") as file:
-            file.seek(start)
-            if encoding == "gzip":
-                with gzip.GzipFile(fileobj=file, mode="rb") as unpacked:
-                    return unpacked.read(count + 1)
-            if encoding == "xz":
-                with lzma.LZMAFile(file) as expanded:
-                    return expanded.read(count + 1)
-            return file.read(count + 1)
-    except (EOFError, zlib.error, lzma.LZMAError, gzip.BadGzipFile):
-        raise CaptureError(f"The {encoding} data of '{path}' is damaged or cut short; get the file anew.") from None
-    except OSError as error:
-        raise CaptureError(f"Cannot read '{path}': {error.strerror or error}.") from None
+def byte_count(shape: Sequence[int], dtype: np.dtype) -> int:
+    """Bytes that a volume occupies."""
+    return math.prod(shape) * dtype.itemsize
 
 
 def text_to_volume(text: str | bytes, shape: tuple[int, int, int], dtype: np.dtype, source: str | Path) -> np.ndarray:
@@ -118,13 +118,16 @@ def text_to_volume(text: str | bytes, shape: tuple[int, int, int], dtype: np.dty
     Raises:
         CaptureError: There are fewer or more, something else, or integers that the type cannot hold.
     """
+    data = text.encode() if isinstance(text, str) else text
     try:
-        values = np.array(text.split(), dtype=np.float64)
+        blocks = [np.array(block.split(), dtype=np.float64) for block in _text_blocks(data)]
     except ValueError:
         raise CaptureError(f"The text in '{source}' holds something else than numbers; get the file anew.") from None
+    values = np.concatenate([np.empty(0), *blocks])
     if values.size != math.prod(shape):
         raise CaptureError(
-            f"'{source}' holds {values.size} numbers where its header says {math.prod(shape)}; get the file anew."
+            f"'{source}' holds {values.size} numbers where its header says {math.prod(shape)}; it is damaged or cut "
+            "short, so get the file anew."
         )
     if dtype.kind in "ui":
         limits = np.iinfo(dtype)
@@ -139,13 +142,44 @@ def to_volume(data: bytes, shape: tuple[int, int, int], dtype: np.dtype, source:
     Raises:
         CaptureError: There are fewer or more bytes.
     """
-    expected = byte_count(shape, dtype, source)
+    expected = byte_count(shape, dtype)
     if len(data) != expected:
         size = " x ".join(str(n) for n in shape)
         amount = f"only {len(data)}" if len(data) < expected else "more"
         raise CaptureError(
             f"'{source}' holds {amount} bytes where {size} samples of {dtype.name} need {expected}; "
-            "check the resolution and the type, or get the file anew."
+            "check the resolution and the type, or get the file anew if it is damaged."
         )
     values = np.frombuffer(data, dtype=dtype).reshape(shape[::-1])
     return values.astype(dtype.newbyteorder("="), copy=False)
+
+
+def three_axes(shape: Sequence[int], source: str | Path) -> tuple[int, int, int]:
+    """The shape of an array, if it is that of a volume of scalars.
+
+    Raises:
+        CaptureError: There are more or fewer axes than three, or one without samples.
+    """
+    if len(shape) != 3 or min(shape) < 1:
+        sizes = " x ".join(str(n) for n in shape)
+        raise CaptureError(
+            f"'{source}' has {len(shape)} dimensions of {sizes} values; give a scalar volume with 3, such as one time "
+            "step or one channel of it."
+        )
+    return shape[0], shape[1], shape[2]
+
+
+def _text_blocks(data: bytes) -> Iterator[bytes]:
+    """Parts of a text of numbers that are cut between these."""
+    start = 0
+    while start < len(data):
+        end = start + _TEXT_BLOCK
+        while end < len(data) and not data[end : end + 1].isspace():
+            end += 1
+        yield data[start:end]
+        start = end
+
+
+def _joined(words: Sequence[float | str]) -> str:
+    text = " ".join(str(word) for word in words)
+    return text if len(text) <= _SHORTEST_PRINTED else text[:_SHORTEST_PRINTED] + "..."

@@ -5,9 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
-import numpy as np
-
-from difftetvr.capture.volumes.volume_file import RawVolume, byte_count, parse_shape, parse_spacing
+from difftetvr.capture.volumes.volume_file import RawVolume, parse_numbers, parse_shape, parse_steps
 from difftetvr.errors import CaptureError
 from difftetvr.vtk_xml import Document, is_numeric
 
@@ -34,21 +32,35 @@ def read_vti(path: Path) -> RawVolume:
     if len(limits) != 6:
         raise CaptureError(f"'{path}' has no valid Extent; get the file anew.")
     shape = parse_shape([limits[2 * axis + 1] - limits[2 * axis] + 1 for axis in range(3)], path)
-    spacing = parse_spacing((image.get("Spacing") or "1 1 1").split(), path)
-    array = _point_array(path, pieces[0])
+    spacing, directions = parse_steps(_steps(image), path)
+    array, note = _point_array(path, pieces[0])
     if not is_numeric(array):
         raise CaptureError(f"'{path}' has values of type '{array.get('type')}'; give integers or floats.")
-    # What is too large to be drawn, whatever its type, need not be decoded.
-    byte_count(shape, np.dtype(np.uint8), path)
     values = document.array(array, shape[0] * shape[1] * shape[2])
-    return RawVolume(values.reshape(shape[::-1]), spacing)
+    return RawVolume(values.reshape(shape[::-1]), spacing, directions, note)
 
 
-def _point_array(path: Path, piece: Element) -> Element:
+def _steps(image: Element) -> list[list[float]]:
+    """From a sample to the next along each axis in the world; an empty list where the image does not tell."""
+    spacing = parse_numbers((image.get("Spacing") or "1 1 1").split())
+    # Row by row; the columns are the axes.
+    matrix = parse_numbers((image.get("Direction") or "1 0 0 0 1 0 0 0 1").split())
+    if len(spacing) != 3 or len(matrix) != 9:
+        return []
+    return [[spacing[axis] * matrix[axis + 3 * row] for row in range(3)] for axis in range(3)]
+
+
+def _point_array(path: Path, piece: Element) -> tuple[Element, tuple[str, ...]]:
+    """The array to show, with a note on those that are not."""
     data = piece.find("PointData")
     arrays = [] if data is None else data.findall("DataArray")
     scalars = [a for a in arrays if (a.get("NumberOfComponents") or "1").strip() in ("1", "0")]
     if data is None or not scalars:
         raise CaptureError(f"'{path}' has no point array with one component; give a scalar volume.")
     active = [a for a in scalars if a.get("Name") == data.get("Scalars")]
-    return (active or scalars)[0]
+    taken = (active or scalars)[0]
+    if len(scalars) == 1:
+        return taken, ()
+    others = ", ".join(repr(array.get("Name")) for array in scalars if array is not taken)
+    why = "its active one" if active else "its first one"
+    return taken, (f"Of the scalars in '{path}', {taken.get('Name')!r} is read, {why}; passed over: {others}.",)

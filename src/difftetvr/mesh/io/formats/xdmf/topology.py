@@ -10,7 +10,7 @@ import numpy as np
 
 from difftetvr.errors import MeshError
 from difftetvr.mesh.io.content import CellBlock, damaged
-from difftetvr.mesh.io.formats.vtk.structured import structured_hexahedra
+from difftetvr.mesh.io.formats.vtk.structured import hexahedra
 from difftetvr.mesh.io.formats.xdmf.items import Items
 
 _KINDS = {
@@ -106,8 +106,8 @@ def shape_of(items: Items, topology: Element, geometry: Element) -> Shape:
         vertices = _structured_points(items, geometry, (nx, ny, nz))
         if min(nx, ny, nz) < 2 or len(vertices) != nx * ny * nz:
             raise damaged(items.path, f"a structured grid of {nx} x {ny} x {nz} points has {len(vertices)} points")
-        hexahedra = structured_hexahedra((nx, ny, nz))
-        return Shape(vertices, (CellBlock("hexahedron", hexahedra, np.arange(len(hexahedra))),))
+        corners = hexahedra((nx, ny, nz)).nodes.reshape(-1, 8)
+        return Shape(vertices, (CellBlock("hexahedron", corners, np.arange(len(corners))),))
     return Shape(_points(items, geometry), _cells(items, topology, name))
 
 

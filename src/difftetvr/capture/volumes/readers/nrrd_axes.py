@@ -1,0 +1,91 @@
+"""What an NRRD header says of its axes: which of them are space, and where they lead."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from difftetvr.capture.volumes.volume_file import parse_numbers
+from difftetvr.errors import CaptureError
+
+_OF_SPACE = ("domain", "space", "none", "???", "")
+_LEFT_HANDED = ("left-anterior-superior", "las", "3d-left-handed")
+
+
+def spatial_axes(path: Path, fields: dict[str, str]) -> list[int]:
+    """The three axes of a scalar volume, the fastest first; others are left out where they hold one sample.
+
+    Raises:
+        CaptureError: The header disagrees with itself, or describes something else: colours, vectors, time steps.
+    """
+    sizes, kinds = fields["sizes"].split(), fields.get("kinds", "").split()
+    if fields["dimension"] != str(len(sizes)) or (kinds and len(kinds) != len(sizes)):
+        raise CaptureError(
+            f"The NRRD header of '{path}' has {fields['dimension'][:20]} dimensions but {len(sizes)} sizes and "
+            f"{len(kinds)} kinds; get the file anew."
+        )
+    vectors = _vectors(fields)
+    is_space = [
+        (kinds[axis] if kinds else "").lower() in _OF_SPACE and (vectors[axis] if axis < len(vectors) else "") != "none"
+        for axis in range(len(sizes))
+    ]
+    axes = list(range(len(sizes)))
+    # Axes of one sample say nothing: first those that are no space, then those of a slice of something larger.
+    for axis in sorted(axes, key=lambda a: (is_space[a], -a)):
+        if len(axes) > 3 and sizes[axis] == "1":
+            axes.remove(axis)
+    if len(axes) != 3 or not all(is_space[axis] for axis in axes):
+        listed = " x ".join(size[:20] for size in sizes)
+        kind = f", of the kinds {' '.join(kinds)}" if kinds else ""
+        raise CaptureError(
+            f"'{path}' has {len(sizes)} dimensions of {listed} values{kind[:120]}, not three of space; give a scalar "
+            "volume, such as one channel or one time step of it."
+        )
+    return axes
+
+
+def axis_steps(path: Path, fields: dict[str, str], axes: list[int]) -> list[list[float]] | None:
+    """From a sample to the next along each of the axes, in a right-handed world; None where the header does not say.
+
+    Raises:
+        CaptureError: What it says is incomplete.
+    """
+    if (vectors := _vectors(fields)) or "spacings" in fields:
+        words = vectors or fields["spacings"].split()
+        if len(words) <= max(axes):
+            raise CaptureError(f"The NRRD header of '{path}' does not tell the distances along all axes; correct it.")
+        chosen = [words[axis] for axis in axes]
+        steps = [_vector(word) for word in chosen] if vectors else _along_axes(parse_numbers(chosen))
+    elif "axismins" in fields and "axismaxs" in fields:
+        steps = _along_axes(_distances(fields, axes))
+    else:
+        return None
+    if fields.get("space", "").lower() in _LEFT_HANDED:
+        steps = [[-step[0], *step[1:]] for step in steps if step]
+    return steps
+
+
+def _vectors(fields: dict[str, str]) -> list[str]:
+    return re.findall(r"none|\([^()]*\)", fields.get("spacedirections", ""))
+
+
+def _vector(text: str) -> list[float]:
+    return parse_numbers(text.strip("()").split(","))
+
+
+def _along_axes(distances: list[float]) -> list[list[float]]:
+    return [[d if axis == other else 0.0 for other in range(3)] for axis, d in enumerate(distances)]
+
+
+def _distances(fields: dict[str, str], axes: list[int]) -> list[float]:
+    """Of samples, by the ends of the axes: those of the outermost cells, or where the header says so, nodes."""
+    lower, upper = (parse_numbers(fields[key].split()) for key in ("axismins", "axismaxs"))
+    centers = (fields.get("centers") or fields.get("centerings") or "").lower().split()
+    distances = []
+    for axis in axes:
+        if max(axis + 1, 2) > min(len(lower), len(upper)):
+            return []
+        is_node = axis < len(centers) and centers[axis] == "node"
+        intervals = int(fields["sizes"].split()[axis]) - int(is_node)
+        distances.append((upper[axis] - lower[axis]) / max(intervals, 1))
+    return distances
