@@ -12,6 +12,7 @@ from .capture import Capture as Capture
 from .loading import load_capture as load_capture
 from .orbit import fibonacci_orbit as fibonacci_orbit
 from .orbit import random_orbit as random_orbit
+from .packed import MixedImages as MixedImages
 from .packed import PackedImages as PackedImages
 from .photos.photo_capture import PhotoCapture as PhotoCapture
 from .photos.photo_capture import is_photo_source as is_photo_source
@@ -26,6 +27,7 @@ __all__ = [
     "TOOTH",
     "Capture",
     "CaptureWarning",
+    "MixedImages",
     "PackedImages",
     "PhotoCapture",
     "Volume",

@@ -11,7 +11,7 @@ import torch
 
 from difftetvr.capture.capture import Capture
 from difftetvr.capture.hull import silhouettes
-from difftetvr.capture.packed import PackedImages
+from difftetvr.capture.packed import Images
 from difftetvr.capture.photos.bounds import hull_bounds, point_bounds, require_resolved, require_seen, surroundings_of
 from difftetvr.capture.photos.photo_load import fitting_downscale, load_photos, make_camera, present_views
 from difftetvr.capture.photos.photo_set import PhotoSet, read_json
@@ -148,8 +148,8 @@ class PhotoCapture:
         self,
         photo_set: PhotoSet,
         cameras: list[Camera],
-        images: torch.Tensor | PackedImages,
-        alphas: torch.Tensor | PackedImages | None,
+        images: Images,
+        alphas: Images | None,
         test: torch.Tensor,
     ) -> tuple[torch.Tensor, float]:
         """(2, 3) float32 bounds, and the surroundings' factor; only images for training are looked at."""

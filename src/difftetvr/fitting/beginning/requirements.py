@@ -24,7 +24,7 @@ def require_fittable(capture: Capture, config: FitConfig, strategy: Strategy | N
     """
     if strategy is not None and config.location == "cell":
         raise FitError("A field on cells cannot be refined; put it on vertices (location vertex), or do not refine.")
-    height, width = capture.images.shape[1:3]
+    width, height = min(capture.image_sizes, key=min)
     if config.loss == "l1-ssim" and min(height, width) < SSIM_WINDOW:
         raise CaptureError(
             f"The images of '{capture.name}' have {width} x {height} pixels, fewer than the {SSIM_WINDOW} that SSIM "

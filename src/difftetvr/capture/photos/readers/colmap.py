@@ -58,7 +58,7 @@ def read_colmap(folder: Path) -> PhotoSet:
         )
     model = read_colmap_model(model_folder)
     root = _image_folder(folder)
-    views = [View(root, i.name, i.world_to_camera, model.cameras[i.camera_id]) for i in model.images]
+    views = [View(root.parent, root, i.name, i.world_to_camera, model.cameras[i.camera_id]) for i in model.images]
     finite = np.isfinite(model.points.positions).all(axis=1)
     points, colors = model.points.positions[finite], model.points.colors[finite] / 255.0
     known = len(points) > 0

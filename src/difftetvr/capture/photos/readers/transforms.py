@@ -6,8 +6,10 @@ docs/nerf_dataset_tips.md of instant-ngp. All three store camera-to-world in Ope
 
 from __future__ import annotations
 
+import os
 import warnings
-from pathlib import Path, PurePosixPath
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,14 +19,18 @@ from difftetvr.capture.photos.photo_set import (
     CaptureWarning,
     PhotoSet,
     View,
+    image_place,
     list_of_objects,
     number_of,
+    numbers_of,
     pixels_of,
     read_json,
+    shown,
     text_of,
 )
 from difftetvr.capture.photos.poses import from_opengl
 from difftetvr.errors import CaptureError
+from difftetvr.trust import file_beside
 
 _PINHOLES = ("", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL")
 # instant-ngp maps positions p to 0.33 p + (0.5, 0.5, 0.5), and its box is a cube of side aabb_scale around the 0.5s.
@@ -41,7 +47,7 @@ def read_nerf_synthetic(folder: Path) -> PhotoSet:
         CaptureError: A file is missing or not valid.
     """
     training = folder / "transforms_train.json"
-    train = _views(folder, training, read_json(training), is_test=False)
+    train = _views(training, read_json(training), is_test=False)
     for view in train:
         if view.file(1) is None:
             raise CaptureError(
@@ -68,13 +74,12 @@ def read_transforms(path: Path) -> PhotoSet:
     """
     file = path / "transforms.json" if path.is_dir() else path
     folder, content = file.parent, read_json(file)
-    views = sorted(_views(folder, file, content, is_test=False), key=lambda view: view.name)
+    views = sorted(_views(file, content, is_test=False), key=lambda view: view.name)
+    places = [_place(view.root / view.name) for view in views]
     held_out = _named(content, "test_filenames", file) or _named(content, "val_filenames", file)
-    used = (_named(content, "train_filenames", file) | held_out) or {_plain(view) for view in views}
+    used = (_named(content, "train_filenames", file) | held_out) or set(places)
     views = [
-        View(v.root, v.name, v.world_to_camera, v.lens, _plain(v) in held_out, v.mask)
-        for v in views
-        if _plain(v) in used
+        replace(view, is_test=place in held_out) for view, place in zip(views, places, strict=True) if place in used
     ]
     if not views:
         raise CaptureError(f"The file names that '{file}' lists for training and testing are none of its frames.")
@@ -87,7 +92,7 @@ def _held_out(folder: Path) -> list[View]:
         file = folder / name
         if not file.is_file():
             continue
-        views = _views(folder, file, read_json(file), is_test=True)
+        views = _views(file, read_json(file), is_test=True)
         present = [view for view in views if view.file(1) is not None]
         if len(present) < len(views):
             missing = len(views) - len(present)
@@ -101,17 +106,14 @@ def _held_out(folder: Path) -> list[View]:
     return []
 
 
-def _views(folder: Path, file: Path, content: dict[str, Any], is_test: bool) -> list[View]:
+def _views(file: Path, content: dict[str, Any], is_test: bool) -> list[View]:
     views = []
     for index, frame in enumerate(list_of_objects(content, "frames", file)):
         where = f"frame {index} of '{file}'"
-        name = PurePosixPath(text_of(frame, "file_path", where).replace("\\", "/"))
-        # The first folder of the path is the one that smaller copies lie beside.
-        root = folder / name.parts[0] if len(name.parts) > 1 else folder
-        inside = PurePosixPath(*name.parts[1:]) if len(name.parts) > 1 else name
+        root, name = image_place(file, text_of(frame, "file_path", where), where)
         pose = from_opengl(frame.get("transform_matrix"), where)
-        mask = folder / text_of(frame, "mask_path", where) if frame.get("mask_path") else None
-        views.append(View(root, str(inside), pose, _lens({**content, **frame}, where), is_test, mask))
+        mask = file_beside(file, text_of(frame, "mask_path", where), CaptureError) if frame.get("mask_path") else None
+        views.append(View(file, root, name, pose, _lens({**content, **frame}, where), is_test, mask))
     return views
 
 
@@ -119,7 +121,7 @@ def _lens(values: dict[str, Any], where: str) -> Lens:
     model = values.get("camera_model") or ""
     if values.get("is_fisheye") or not isinstance(model, str) or model.upper() not in _PINHOLES:
         raise CaptureError(
-            f"The camera model of {where} is {model or 'a fisheye'!r}; undistort its images to a pinhole first."
+            f"The camera model of {where} is {shown(model or 'a fisheye')}; undistort its images to a pinhole first."
         )
 
     def number(key: str) -> float | None:
@@ -148,13 +150,12 @@ def _box(content: dict[str, Any], where: str) -> np.ndarray | None:
         return None
     scale = number_of(content, "scale", where) or _NGP_SCALE
     offset = content.get("offset", _NGP_OFFSET)
-    try:
-        offsets = np.broadcast_to(np.array(offset, dtype=np.float64), (3,))
-    except (TypeError, ValueError):
-        offsets = np.full(3, np.nan)
-    if side <= 0 or not np.isfinite(offsets).all():
-        raise CaptureError(f"The aabb_scale {side:g} or the offset {offset!r} of {where} is not valid; correct them.")
-    center = (_NGP_CENTER - offsets) / scale
+    offsets = numbers_of(offset)
+    if side <= 0 or offsets.shape not in ((), (3,)) or not np.isfinite(offsets).all():
+        raise CaptureError(
+            f"The aabb_scale {side:g} or the offset {shown(offset)} of {where} is not valid; correct them."
+        )
+    center = (_NGP_CENTER - np.broadcast_to(offsets, (3,))) / scale
     half = 0.5 / abs(scale)
     return np.stack([center - half, center + half])
 
@@ -163,9 +164,9 @@ def _named(content: dict[str, Any], key: str, file: Path) -> set[str]:
     names = content.get(key) or []
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise CaptureError(f"'{key}' of '{file}' is no list of file names; correct or remove it.")
-    return {str(PurePosixPath(name)) for name in names}
+    return {_place(file.parent / name.replace("\\", "/")) for name in names}
 
 
-def _plain(view: View) -> str:
-    """The path of a view's image as nerfstudio's lists of files write it."""
-    return str(PurePosixPath(view.root.name) / view.name)
+def _place(path: Path) -> str:
+    """By which the image of a frame and a name in nerfstudio's lists are compared."""
+    return os.path.abspath(path)
