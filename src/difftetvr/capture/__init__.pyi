@@ -1,5 +1,6 @@
 from . import capture as capture
 from . import capture_file as capture_file
+from . import degenerate as degenerate
 from . import free_space as free_space
 from . import hull as hull
 from . import loading as loading

@@ -12,6 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from difftetvr.capture.capture import Capture
+from difftetvr.capture.degenerate import why_degenerate
 from difftetvr.capture.packed import Masks
 from difftetvr.errors import counted
 from difftetvr.fitting.records.evaluation import Evaluation
@@ -111,6 +112,8 @@ def capture_table(name: str, capture: Capture) -> Table:
         table.add_row("surroundings", f"{capture.surroundings:.3g} times as large")
     if capture.valid is not None:
         table.add_row("masked", f"{100.0 * _masked_share(capture.valid):.1f} % of the pixels")
+    if (reason := why_degenerate(capture)) is not None:
+        table.add_row("degenerate", reason)
     table.add_row("density unit", f"{capture.density_unit:g} per unit length")
     return table
 
