@@ -201,6 +201,10 @@ def test_captures_of_the_first_version_are_read(tmp_path: Path) -> None:
     np.savez(tmp_path / "new.npz", **{**content, "version": np.array(5)})
     with pytest.raises(CaptureError, match="version 5; update"):
         Capture.load(tmp_path / "new.npz")
+    for version in (np.inf, np.nan, "three", [1, 2], 1j):
+        np.savez(tmp_path / "new.npz", **{**content, "version": np.array(version)})
+        with pytest.raises(CaptureError, match="wrong shape or type"):
+            Capture.load(tmp_path / "new.npz")
 
 
 @pytest.mark.parametrize(

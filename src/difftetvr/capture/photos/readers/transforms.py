@@ -29,10 +29,17 @@ from difftetvr.capture.photos.photo_set import (
     text_of,
 )
 from difftetvr.capture.photos.poses import from_opengl
+from difftetvr.capture.photos.readers.ply_points import read_ply_points
 from difftetvr.errors import CaptureError
 from difftetvr.trust import file_beside
 
 _PINHOLES = ("", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL")
+# What changes nothing here, although the file says it.
+_UNUSED = {
+    "depth_file_path": "depth maps (depth_file_path)",
+    "depth_path": "depth maps (depth_path)",
+    "rolling_shutter": "a rolling shutter",
+}
 # instant-ngp maps positions p to 0.33 p + (0.5, 0.5, 0.5), and its box is a cube of side aabb_scale around the 0.5s.
 _NGP_SCALE, _NGP_OFFSET, _NGP_CENTER = 0.33, 0.5, 0.5
 
@@ -63,6 +70,7 @@ def read_transforms(path: Path) -> PhotoSet:
 
     Intrinsics may stand at the top or, overriding that, in each frame. Distortion is OpenCV's k1, k2, p1, p2, k3.
     nerfstudio's lists of ``train_filenames`` and ``test_filenames`` (or ``val_filenames``) are kept to.
+    The points of its ``ply_file_path`` are the sparse points.
     Where there is an ``aabb_scale``, the bounds are instant-ngp's unit cube, by its ``scale`` and ``offset``.
     Listed images may be absent, as instant-ngp allows.
 
@@ -83,8 +91,17 @@ def read_transforms(path: Path) -> PhotoSet:
     ]
     if not views:
         raise CaptureError(f"The file names that '{file}' lists for training and testing are none of its frames.")
-    name = folder.resolve().name
-    return PhotoSet(name, views, has_split=bool(held_out), may_miss=True, rough_bounds=_box(content, f"'{file}'"))
+    points, colors = _sparse_points(content, file)
+    _warn_of_unused(content, file)
+    return PhotoSet(
+        folder.resolve().name,
+        views,
+        has_split=bool(held_out),
+        may_miss=True,
+        points=points,
+        point_colors=colors,
+        rough_bounds=_box(content, f"'{file}'"),
+    )
 
 
 def _held_out(folder: Path) -> list[View]:
@@ -141,6 +158,29 @@ def _lens(values: dict[str, Any], where: str) -> Lens:
         height=pixels_of(values, "h", where),
         distortion=distortion,
     )
+
+
+def _sparse_points(content: dict[str, Any], file: Path) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Positions and colours from the PLY file that nerfstudio names; None where there is none."""
+    if content.get("ply_file_path") is None:
+        return None, None
+    path = file_beside(file, text_of(content, "ply_file_path", f"'{file}'"), CaptureError)
+    if not path.exists():
+        warnings.warn(
+            f"The sparse points '{path}' that '{file}' names are missing; it is read without.",
+            CaptureWarning,
+            stacklevel=3,
+        )
+        return None, None
+    points, colors = read_ply_points(path)
+    return (points, colors) if len(points) else (None, None)
+
+
+def _warn_of_unused(content: dict[str, Any], file: Path) -> None:
+    frames = list_of_objects(content, "frames", file)
+    unused = [what for key, what in _UNUSED.items() if key in content or any(key in frame for frame in frames)]
+    if unused:
+        warnings.warn(f"'{file}' has {' and '.join(unused)}, not used here.", CaptureWarning, stacklevel=3)
 
 
 def _box(content: dict[str, Any], where: str) -> np.ndarray | None:
