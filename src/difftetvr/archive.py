@@ -51,6 +51,7 @@ def read_arrays(
     require_regular(path, error)
     try:
         with zipfile.ZipFile(path) as archive:
+            _require_compression_of_numpy(archive, path, error)
             members = {m: header for m in archive.infolist() if (header := _header(archive, m)) is not None}
             chosen = {m: h for m, h in members.items() if wanted(_plain(m.filename), h.shape)}
             require_modest(path, sum(header.size for header in chosen.values()), "arrays", error)
@@ -106,6 +107,15 @@ class _Header:
             raise ValueError("it is cut short")
         values = np.frombuffer(data, self.dtype) if data else np.empty(math.prod(self.shape), self.dtype)
         return values.reshape(self.shape[::-1]).T if self.fortran else values.reshape(self.shape)
+
+
+def _require_compression_of_numpy(archive: zipfile.ZipFile, path: Path, error: type[DiffTetError]) -> None:
+    """Of other methods zipfile unpacks gigabytes at once where a header's bytes are asked for."""
+    for member in archive.infolist():
+        if member.filename.endswith(_SUFFIX) and member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise error(
+                f"{path} is compressed as numpy does not compress archives; write it with numpy.savez_compressed."
+            )
 
 
 def _header(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> _Header | None:

@@ -153,6 +153,23 @@ def require_modest(path: Path, size: int, what: str, error: type[DiffTetError]) 
     return most
 
 
+def require_free(size: int, what: str, advice: str, error: type[DiffTetError]) -> None:
+    """Checks that there is memory for something before it is made.
+
+    Args:
+        size: Bytes.
+        what: What takes them, at the beginning of the sentence.
+        advice: What to do where it does not fit.
+        error: The exception to raise.
+
+    Raises:
+        DiffTetError: (of type ``error``) There is not.
+    """
+    free = int(_SHARE_OF_FREE_MEMORY * free_memory())
+    if size > free:
+        raise error(f"{what} would take {_bytes(size)}, but only {_bytes(free)} of memory can be used; {advice}.")
+
+
 def current_trust() -> Trust:
     """What the caller allows; for readers that run in a process of their own and have to be told there."""
     return _TRUST.get() or Trust()

@@ -1,5 +1,6 @@
 from . import capture as capture
 from . import capture_file as capture_file
+from . import degenerate as degenerate
 from . import free_space as free_space
 from . import hull as hull
 from . import loading as loading
@@ -12,6 +13,7 @@ from .capture import Capture as Capture
 from .loading import load_capture as load_capture
 from .orbit import fibonacci_orbit as fibonacci_orbit
 from .orbit import random_orbit as random_orbit
+from .packed import MixedImages as MixedImages
 from .packed import PackedImages as PackedImages
 from .photos.photo_capture import PhotoCapture as PhotoCapture
 from .photos.photo_capture import is_photo_source as is_photo_source
@@ -26,6 +28,7 @@ __all__ = [
     "TOOTH",
     "Capture",
     "CaptureWarning",
+    "MixedImages",
     "PackedImages",
     "PhotoCapture",
     "Volume",

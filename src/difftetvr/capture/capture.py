@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
@@ -13,7 +14,7 @@ import torch
 from difftetvr.capture.capture_file import read_capture, write_capture
 from difftetvr.capture.free_space import FreeSpace
 from difftetvr.capture.hull import silhouettes
-from difftetvr.capture.packed import PackedImages
+from difftetvr.capture.packed import Images, Masks, MixedImages, PackedImages, shapes_of
 from difftetvr.errors import CaptureError
 from difftetvr.rendering.cameras.pinhole import Camera
 
@@ -33,9 +34,10 @@ class Capture:
     encoded twice nor compared across spaces.
 
     Attributes:
-        cameras: N cameras, all of the images' size.
+        cameras: N cameras, each of its image's size.
         images: (N, H, W, 3) float32 RGB, premultiplied over black, on the CPU. Photographs are kept as bytes, and
-            unpacked to the same view by view when they are taken by index.
+            unpacked to the same view by view when they are taken by index: ``images[view]``. Images of several sizes
+            are :class:`~difftetvr.capture.MixedImages`, of which there is no more than that.
         alphas: (N, H, W) in [0, 1], kept as the images are, or None where they are unknown; the background is black
             then.
         test: (N,) bool, views that training never sees. At least one view must be left for training.
@@ -45,8 +47,8 @@ class Capture:
         name: What to call the capture.
         density_unit: Typical density per world unit, a scale for optimisers; 0 stands for 25 / longest side of the box.
         encoding: Whether the images hold linear light (``linear``) or sRGB-encoded values (``srgb``).
-        valid: (N, H, W) bool, false for pixels that masks of the capture exclude and that no loss should count; None
-            where all are valid.
+        valid: (N, H, W) bool, false for pixels that masks of the capture exclude and that no loss should count; as
+            MixedImages where the images are. None where all are valid.
         points: (P, 3) float32 points on the scene's surfaces, in world space, or None where none are known.
         point_colors: (P, 3) float32 colours of the points in [0, 1], encoded as the images are, or None.
 
@@ -55,14 +57,14 @@ class Capture:
     """
 
     cameras: list[Camera]
-    images: torch.Tensor | PackedImages
-    alphas: torch.Tensor | PackedImages | None
+    images: Images
+    alphas: Images | None
     test: torch.Tensor
     bounds: torch.Tensor
     name: str
     density_unit: float = 0.0
     encoding: Encoding = "linear"
-    valid: torch.Tensor | None = None
+    valid: Masks | None = None
     points: torch.Tensor | None = None
     point_colors: torch.Tensor | None = None
     surroundings: float = 1.0
@@ -95,30 +97,46 @@ class Capture:
             raise CaptureError(f"The surroundings of '{self.name}' are {self.surroundings}; they must be at least 1.")
 
     def _check_images(self) -> None:
-        shape = tuple(self.images.shape)
-        if len(shape) != 4 or shape[3] != 3 or 0 in shape:
+        shapes = shapes_of(self.images)
+        wrong = next((shape for shape in shapes or [()] if len(shape) != 3 or shape[2] != 3 or 0 in shape), None)
+        if wrong is not None:
             raise CaptureError(
-                f"The images of '{self.name}' have shape {shape}; they need (N, H, W, 3), none of them 0."
+                f"The images of '{self.name}' have shape {(len(shapes), *wrong)}; they need (N, H, W, 3), none of "
+                "them 0."
             )
-        if not isinstance(self.images, PackedImages):
-            self.images = self.images.to("cpu", torch.float32)
-            self._check_views(
-                ~torch.isfinite(self.images) | (self.images < 0), "a colour that is negative or not finite"
-            )
+        self.images = self._checked(
+            self.images, lambda v: ~torch.isfinite(v) | (v < 0), "a colour that is negative or not finite"
+        )
         if self.alphas is None:
             return
-        if self.alphas.shape != shape[:3]:
-            raise CaptureError(f"The alphas of '{self.name}' have shape {tuple(self.alphas.shape)}, not {shape[:3]}.")
-        if not isinstance(self.alphas, PackedImages):
-            self.alphas = self.alphas.to("cpu", torch.float32)
-            self._check_views(~((self.alphas >= 0) & (self.alphas <= 1)), "an alpha outside [0, 1]")
+        self._check_shapes("alphas", self.alphas)
+        self.alphas = self._checked(self.alphas, lambda v: ~((v >= 0) & (v <= 1)), "an alpha outside [0, 1]")
+
+    def _check_shapes(self, name: str, values: Images) -> None:
+        """One value for each pixel."""
+        mine, wanted = shapes_of(values), [shape[:2] for shape in shapes_of(self.images)]
+        if isinstance(values, MixedImages) != isinstance(self.images, MixedImages):
+            raise CaptureError(
+                f"The {name} of '{self.name}' must be MixedImages where, and only where, the images are."
+            )
+        if mine == wanted:
+            return
+        if not isinstance(values, MixedImages):
+            shape = (len(wanted), *wanted[0])
+            raise CaptureError(f"The {name} of '{self.name}' have shape {tuple(values.shape)}, not {shape}.")
+        view = next((view for view, (one, other) in enumerate(zip(mine, wanted)) if one != other), len(mine))
+        raise CaptureError(
+            f"The {name} of '{self.name}' do not fit its images in view {view}; give one for each pixel."
+        )
 
     def _check_optional(self) -> None:
         if self.encoding not in get_args(Encoding):
             raise CaptureError(f"The encoding of '{self.name}' is '{self.encoding}'; it must be linear or srgb.")
-        shape = self.images.shape[:3]
-        if self.valid is not None and (self.valid.shape != shape or self.valid.dtype != torch.bool):
-            raise CaptureError(f"The valid pixels of '{self.name}' must be {tuple(shape)} bools, one for each pixel.")
+        if self.valid is not None:
+            self._check_shapes("valid pixels", self.valid)
+            parts = self.valid.data if isinstance(self.valid, MixedImages) else (self.valid,)
+            if any(part.dtype != torch.bool for part in parts):
+                raise CaptureError(f"The valid pixels of '{self.name}' must be bools, one for each pixel.")
         for name in ("points", "point_colors"):
             values = getattr(self, name)
             if values is None:
@@ -129,21 +147,39 @@ class Capture:
         if self.point_colors is not None and (self.points is None or len(self.points) != len(self.point_colors)):
             raise CaptureError(f"'{self.name}' needs a point for each of its point_colors; give as many of both.")
 
-    def _check_views(self, wrong: torch.Tensor, what: str) -> None:
-        views = wrong.flatten(1).any(dim=1)
+    def _checked(self, values: Images, is_wrong: Callable[[torch.Tensor], torch.Tensor], what: str) -> Images:
+        """Images on the CPU, as float32 where they are no bytes, which cannot be wrong."""
+        if isinstance(values, PackedImages):
+            return values
+        if isinstance(values, torch.Tensor):
+            values = values.to("cpu", torch.float32)
+            self._refuse(is_wrong(values).flatten(1).any(dim=1), what)
+            return values
+        views = [v if v.dtype == torch.uint8 else v.to("cpu", torch.float32) for v in values.data]
+        self._refuse(torch.tensor([v.dtype != torch.uint8 and bool(is_wrong(v).any()) for v in views]), what)
+        return MixedImages(tuple(views))
+
+    def _refuse(self, views: torch.Tensor, what: str) -> None:
         if bool(views.any()):
             raise CaptureError(f"View {int(views.nonzero()[0])} of '{self.name}' has {what}; correct the image.")
 
     def _check_cameras(self) -> None:
-        count, height, width = self.images.shape[:3]
-        if len(self.cameras) != count:
-            raise CaptureError(f"'{self.name}' has {count} images but {len(self.cameras)} cameras; give one for each.")
-        for index, camera in enumerate(self.cameras):
+        sizes = [(width, height) for height, width, _ in shapes_of(self.images)]
+        if len(self.cameras) != len(sizes):
+            raise CaptureError(
+                f"'{self.name}' has {len(sizes)} images but {len(self.cameras)} cameras; give one for each."
+            )
+        for index, (camera, (width, height)) in enumerate(zip(self.cameras, sizes, strict=True)):
             if (camera.width, camera.height) != (width, height):
                 raise CaptureError(
                     f"Camera {index} of '{self.name}' is for {camera.width} x {camera.height} pixels but its image has "
                     f"{width} x {height}; scale one of them."
                 )
+
+    @property
+    def image_sizes(self) -> list[tuple[int, int]]:
+        """Width and height of each view in pixels."""
+        return [(camera.width, camera.height) for camera in self.cameras]
 
     @property
     def train_indices(self) -> torch.Tensor:
@@ -203,8 +239,8 @@ class Capture:
         return inside if len(inside) else None
 
     @cached_property
-    def silhouettes(self) -> torch.Tensor | None:
-        """(M, H, W) bool, where the M training views may show the object: where alpha is not 0, or in a black border.
+    def silhouettes(self) -> list[torch.Tensor] | None:
+        """(H, W) bool of each training view, where it may show the object: where alpha is not 0, or in a black border.
 
         None where nothing tells the object from its background.
         """

@@ -10,16 +10,18 @@ import numpy as np
 import torch
 
 from difftetvr.archive import read_arrays
-from difftetvr.capture.packed import PackedImages
+from difftetvr.capture.packed import Images, MixedImages, PackedImages, shapes_of
 from difftetvr.errors import CameraError, CaptureError
 from difftetvr.files import atomic_write
 from difftetvr.rendering.cameras.pinhole import Camera
 
-# Version 1 knew no encoding (all was linear), no bytes, no points and no masks, version 2 no surroundings.
-_VERSION = 3
+# Version 1 knew no encoding (all was linear), no bytes, no points and no masks, version 2 no surroundings, version 3
+# no images of several sizes; where they are of one size, version 3 is still what is written.
+_VERSION, _VERSION_OF_ONE_SIZE = 4, 3
 _NEEDED = ("version", "images", "test", "bounds", "name", "density_unit", "world_to_camera", "intrinsics")
 _OPTIONAL = ("alphas", "valid", "points", "point_colors")
-_KNOWN = (*_NEEDED, *_OPTIONAL, "encoding", "surroundings")
+_PER_PIXEL = ("images", "alphas", "valid")
+_KNOWN = (*_NEEDED, *_OPTIONAL, "encoding", "surroundings", "sizes")
 
 
 def write_capture(path: str | Path, fields: Mapping[str, Any]) -> None:
@@ -34,10 +36,11 @@ def write_capture(path: str | Path, fields: Mapping[str, Any]) -> None:
     """
     if Path(path).suffix.lower() != ".npz":
         raise CaptureError(f"A capture is saved as .npz; '{path}' ends otherwise.")
-    cameras = fields["cameras"]
+    cameras, images = fields["cameras"], fields["images"]
+    is_mixed = isinstance(images, MixedImages)
     content: dict[str, Any] = {
-        "version": np.array(_VERSION),
-        "images": _array(fields["images"]),
+        "version": np.array(_VERSION if is_mixed else _VERSION_OF_ONE_SIZE),
+        "images": _array(images),
         "test": fields["test"].numpy(),
         "bounds": fields["bounds"].numpy(),
         "name": np.array(fields["name"]),
@@ -47,6 +50,8 @@ def write_capture(path: str | Path, fields: Mapping[str, Any]) -> None:
         "encoding": np.array(fields["encoding"]),
         "surroundings": np.array(fields["surroundings"]),
     }
+    if is_mixed:
+        content["sizes"] = np.array([shape[:2] for shape in shapes_of(images)])
     for key in _OPTIONAL:
         value = fields[key]
         if value is not None:
@@ -70,10 +75,11 @@ def read_capture(path: str | Path) -> dict[str, Any]:
             raise CaptureError(f"'{path}' has the version {content['version']}; update difftetvr to read it.")
         tensors = {key: torch.from_numpy(content[key]) for key in ("images", "test", "bounds", "world_to_camera")}
         tensors |= {key: torch.from_numpy(content[key]) for key in _OPTIONAL if key in content}
-        height, width = (int(n) for n in content["images"].shape[1:3])
+        poses = tensors.pop("world_to_camera")
+        sizes = _sizes(content, len(poses))
         cameras = [
             Camera(pose, float(fx), float(fy), float(cx), float(cy), width, height)
-            for pose, (fx, fy, cx, cy) in zip(tensors.pop("world_to_camera"), content["intrinsics"], strict=True)
+            for pose, (fx, fy, cx, cy), (height, width) in zip(poses, content["intrinsics"], sizes, strict=True)
         ]
         return {
             "cameras": cameras,
@@ -82,7 +88,7 @@ def read_capture(path: str | Path) -> dict[str, Any]:
             "density_unit": float(content["density_unit"]),
             "encoding": str(content.get("encoding", "linear")),
             "surroundings": float(content.get("surroundings", 1.0)),
-            **{key: _packed_if_bytes(key, tensor) for key, tensor in tensors.items()},
+            **{key: _restored(key, tensor, sizes if "sizes" in content else None) for key, tensor in tensors.items()},
         }
     except CameraError as error:
         raise CaptureError(f"A camera in '{path}' is not valid: {error}") from None
@@ -90,9 +96,34 @@ def read_capture(path: str | Path) -> dict[str, Any]:
         raise CaptureError(f"An array in '{path}' has the wrong shape or type; get the file anew.") from None
 
 
-def _array(values: torch.Tensor | PackedImages) -> np.ndarray:
+def _array(values: Images) -> np.ndarray:
+    """The values of all views; where these have several sizes, those of all pixels one after the other."""
+    if isinstance(values, MixedImages):
+        return np.concatenate([view.flatten(0, 1).numpy() for view in values.data])
     return (values.data if isinstance(values, PackedImages) else values).numpy()
 
 
-def _packed_if_bytes(key: str, tensor: torch.Tensor) -> torch.Tensor | PackedImages:
-    return PackedImages(tensor) if key in ("images", "alphas") and tensor.dtype == torch.uint8 else tensor
+def _sizes(content: Mapping[str, np.ndarray], count: int) -> list[tuple[int, int]]:
+    """Height and width of each view.
+
+    Raises:
+        ValueError: The sizes are none, or do not fit the pixels.
+    """
+    if "sizes" not in content:
+        height, width = content["images"].shape[1:3]
+        return [(height, width)] * count
+    sizes = [(int(height), int(width)) for height, width in content["sizes"]]
+    pixels = sum(height * width for height, width in sizes)
+    lengths = {len(content[key]) for key in _PER_PIXEL if key in content}
+    if any(min(size) < 1 for size in sizes) or lengths != {pixels}:
+        raise ValueError("the sizes do not fit the pixels")
+    return sizes
+
+
+def _restored(key: str, tensor: torch.Tensor, sizes: list[tuple[int, int]] | None) -> Images:
+    if key not in _PER_PIXEL:
+        return tensor
+    if sizes is not None:
+        views = tensor.split([height * width for height, width in sizes])
+        return MixedImages(tuple(v.unflatten(0, size) for v, size in zip(views, sizes, strict=True)))
+    return PackedImages(tensor) if key != "valid" and tensor.dtype == torch.uint8 else tensor

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from difftetvr.capture.packed import PackedImages
+from difftetvr.capture.packed import Images
 from difftetvr.capture.viewing import in_image, project
 from difftetvr.rendering.cameras.pinhole import Camera
 
@@ -23,23 +23,22 @@ _BLACK_BORDER = 0.95
 _LEAST_TRANSPARENT = 0.1
 
 
-def silhouettes(
-    images: torch.Tensor | PackedImages, alphas: torch.Tensor | PackedImages | None, views: Sequence[int]
-) -> torch.Tensor | None:
-    """(M, H, W) bool, where the object may be seen: where alpha is not 0, or where black surrounds what is not black.
+def silhouettes(images: Images, alphas: Images | None, views: Sequence[int]) -> list[torch.Tensor] | None:
+    """Where the object may be seen: where alpha is not 0, or where black surrounds what is not black.
 
     Args:
-        images: (N, H, W, 3) images over black.
-        alphas: (N, H, W), or None where they are unknown.
-        views: The M views to look at.
+        images: (N, H, W, 3) images over black, or of several sizes.
+        alphas: (N, H, W) likewise, or None where they are unknown.
+        views: The views to look at.
 
     Returns:
-        The masks, or None where nothing tells the object from its background: few pixels are transparent, or it is not
-        black around the object.
+        (H, W) bool masks of the views, or None where nothing tells the object from its background: few pixels are
+        transparent, or it is not black around the object.
     """
     if alphas is not None:
-        masks = torch.stack([alphas[view] > _LEAST_ALPHA for view in views])
-        return masks if float((~masks).float().mean()) >= _LEAST_TRANSPARENT else None
+        masks = [alphas[view] > _LEAST_ALPHA for view in views]
+        transparent = sum(int((~mask).sum()) for mask in masks)
+        return masks if transparent >= _LEAST_TRANSPARENT * sum(mask.numel() for mask in masks) else None
     found, border = [], []
     for view in views:
         mask = (images[view] > _LEAST_RADIANCE).any(dim=-1)
@@ -51,8 +50,7 @@ def silhouettes(
     if np.mean(border) < _BLACK_BORDER:
         return None
     # What is black inside the object belongs to it.
-    filled = [ndimage.binary_fill_holes(mask.numpy()) for mask in found]
-    return torch.from_numpy(np.stack(filled))
+    return [torch.from_numpy(ndimage.binary_fill_holes(mask.numpy())) for mask in found]
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,12 +66,12 @@ class VisualHull:
     shapes: list[Silhouette | None]
 
     @staticmethod
-    def of(cameras: Sequence[Camera], masks: torch.Tensor | None, most: int | None = None) -> VisualHull:
+    def of(cameras: Sequence[Camera], masks: Sequence[torch.Tensor] | None, most: int | None = None) -> VisualHull:
         """The hull of N views, or of evenly chosen ones.
 
         Args:
             cameras: N cameras.
-            masks: (N, H, W) bool silhouettes, see :func:`silhouettes`; None: the views rule nothing out.
+            masks: N silhouettes, see :func:`silhouettes`; None: the views rule nothing out.
             most: How many views to use at most; None: all.
         """
         step = 1 if most is None else -(-len(cameras) // most)
@@ -81,8 +79,8 @@ class VisualHull:
         shapes: list[Silhouette | None] = [None] * len(chosen)
         if masks is not None:
             # A blank image among others would rule out everything that it could see.
-            is_blank = bool(masks.any()) & ~masks[::step].flatten(1).any(1)
-            shapes = [None if no else Silhouette.of(mask) for no, mask in zip(is_blank, masks[::step], strict=True)]
+            shows_any = any(bool(mask.any()) for mask in masks)
+            shapes = [None if shows_any and not mask.any() else Silhouette.of(mask) for mask in masks[::step]]
         return VisualHull(chosen, shapes)
 
     def keeps(self, centers: NDArray[np.float64], cell: float, least_share: float) -> NDArray[np.bool_]:

@@ -8,6 +8,7 @@ from typing import Any
 
 from difftetvr.capture.capture import Capture
 from difftetvr.capture.photos.photo_capture import PhotoCapture, is_photo_source
+from difftetvr.capture.photos.readers.foreign import known_export
 from difftetvr.capture.volumes.readers.table import KNOWN, is_volume_file
 from difftetvr.capture.volumes.volume_capture import TOOTH, VolumeCapture
 from difftetvr.errors import CaptureError
@@ -18,8 +19,8 @@ def load_capture(source: str | Path, **overrides: Any) -> Capture:
 
     Args:
         source: ``tooth`` for the packaged scan, a volume that `Volume.load` reads, a capture saved as ``.npz``,
-            or photographs with known cameras: a folder (NeRF-synthetic, nerfstudio, instant-ngp, COLMAP, or with a
-            cameras.json of our own), such a ``.json`` file, or a tiny NeRF ``.npz``.
+            or photographs with known cameras: a folder (NeRF-synthetic, nerfstudio, instant-ngp, COLMAP, Polycam,
+            Record3D, or with a cameras.json of our own), such a ``.json`` file, or a tiny NeRF ``.npz``.
         **overrides: Fields of :class:`VolumeCapture` for the tooth and for volumes; a volume needs at least
             ``transfer_function``. Fields of :class:`PhotoCapture` for photographs. None stands for the field's default.
 
@@ -48,6 +49,8 @@ def _kind(source: str | Path, chosen: dict[str, Any]) -> type[VolumeCapture | Ph
         return PhotoCapture
     if Path(source).suffix.lower() == ".npz":
         return None
+    if (export := known_export(Path(source))) is not None:
+        raise CaptureError(f"'{source}' {export}.")
     raise CaptureError(
         f"'{source}' is no capture: give 'tooth', a volume ({KNOWN}), a saved capture (.npz), or a folder of photos "
         "with their cameras."

@@ -1,9 +1,10 @@
-"""Images kept as bytes: a quarter of the memory of floats, which photographs do not fill."""
+"""Images in memory: as bytes, a quarter of the memory of floats, which photographs do not fill, or each of its size."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import torch
 
@@ -22,10 +23,13 @@ class PackedImages:
 
     def __getitem__(self, index: Any) -> torch.Tensor:
         """Float32 values in [0, 1] of what the index selects, as for a tensor."""
-        return self.data[index].to(torch.float32) / 255.0
+        return _unpacked(self.data[index])
 
     def __len__(self) -> int:
         return len(self.data)
+
+    def __iter__(self) -> Iterator[torch.Tensor]:
+        return (self[view] for view in range(len(self)))
 
     @property
     def shape(self) -> torch.Size:
@@ -41,3 +45,49 @@ class PackedImages:
         """Mean of all values, a scalar."""
         means = torch.stack([view.to(torch.float64).mean() for view in self.data])
         return (means.mean() / 255.0).to(dtype)
+
+
+@dataclass(frozen=True, eq=False)
+class MixedImages:
+    """Images, alphas or masks of several sizes, which are taken one by one: ``mixed[view]``.
+
+    Attributes:
+        data: N tensors on the CPU, (H, W, 3) images or (H, W) alphas or masks, each with a size of its own. uint8
+            values are unpacked to float32 when they are taken, 255 to 1; others are as they are.
+    """
+
+    data: tuple[torch.Tensor, ...]
+
+    def __getitem__(self, view: int) -> torch.Tensor:
+        """The values of one view."""
+        values = self.data[view]
+        return _unpacked(values) if values.dtype == torch.uint8 else values
+
+    def __len__(self) -> int:
+        return len(self.data)
+
+    def __iter__(self) -> Iterator[torch.Tensor]:
+        return (self[view] for view in range(len(self)))
+
+    def mean(self, dtype: torch.dtype = torch.float32) -> torch.Tensor:
+        """Mean of all values, a scalar."""
+        total = sum(float(view.to(torch.float64).sum()) for view in self)
+        return torch.tensor(total / sum(view.numel() for view in self.data), dtype=dtype)
+
+
+Images: TypeAlias = torch.Tensor | PackedImages | MixedImages
+"""Images or alphas of N views, which ``images[view]`` takes as float32."""
+
+Masks: TypeAlias = torch.Tensor | MixedImages
+"""Masks of N views, which ``masks[view]`` takes as bool."""
+
+
+def shapes_of(values: Images) -> list[tuple[int, ...]]:
+    """The shape of each view's values."""
+    if isinstance(values, MixedImages):
+        return [tuple(view.shape) for view in values.data]
+    return [tuple(values.shape[1:])] * (values.shape[0] if values.shape else 0)
+
+
+def _unpacked(values: torch.Tensor) -> torch.Tensor:
+    return values.to(torch.float32) / 255.0

@@ -75,7 +75,9 @@ class TrustOptions:
 class CaptureOptions:
     """How images are read, or a volume is seen; what is not given is found by looking, or as in the Tooth benchmark."""
 
-    format: Literal["nerf-synthetic", "transforms", "colmap", "cameras", "tiny-nerf"] | None = None
+    format: Literal["nerf-synthetic", "transforms", "colmap", "cameras", "tiny-nerf", "polycam", "record3d"] | None = (
+        None
+    )
     """What a folder of photos is; default: found by looking."""
     downscale: int | None = None
     """Pixels of a photo along x and y that are averaged to one; default: so many that the longer side has at most 240

@@ -205,7 +205,7 @@ class FitConfig:
         return dataclasses.replace(self, **left_open)
 
     def _choices_for_photos(self, capture: Capture) -> dict[str, Any]:
-        pixels = len(capture.train_indices) * math.prod(capture.images.shape[1:3])
+        pixels = sum(math.prod(capture.image_sizes[view]) for view in capture.train_indices.tolist())
         without_silhouettes = "grid" if capture.scene_points is None or self.grid is not None else "points"
         # Bounds alone do not say what else may stand before them.
         free_space = _FREE_BEFORE_BOUNDS if capture.scene_points is None else _FREE_BEFORE_POINTS

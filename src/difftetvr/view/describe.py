@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,8 +13,11 @@ from rich.table import Table
 from rich.text import Text
 
 from difftetvr.capture.capture import Capture
+from difftetvr.capture.degenerate import why_degenerate
+from difftetvr.capture.packed import Masks
 from difftetvr.capture.volumes.summary import VolumeSummary
 from difftetvr.capture.volumes.value_range import range_text
+from difftetvr.errors import counted
 from difftetvr.fitting.records.evaluation import Evaluation
 from difftetvr.mesh.field import Field
 from difftetvr.mesh.frame import WORLD
@@ -25,6 +29,7 @@ from difftetvr.mesh.tetmesh import TetMesh
 
 _QUALITY_BINS = 10
 _BAR_WIDTH = 30
+_SIZES_SHOWN = 4
 
 
 @dataclass(frozen=True)
@@ -136,11 +141,13 @@ def run_table(name: str, config: dict[str, Any], metrics: dict[str, Any]) -> Tab
 
 def capture_table(name: str, capture: Capture) -> Table:
     """Number and size of the images, split and bounds of a capture."""
-    count, height, width, _ = capture.images.shape
     lower, upper = capture.bounds.tolist()
     table = _table(name)
-    table.add_row("views", f"{count} ({len(capture.train_indices)} training, {len(capture.test_indices)} held out)")
-    table.add_row("image size", f"{width} x {height}")
+    table.add_row(
+        "views", f"{len(capture.cameras)} ({len(capture.train_indices)} training, {len(capture.test_indices)} held out)"
+    )
+    sizes = Counter(capture.image_sizes).most_common()
+    table.add_row("image size" if len(sizes) == 1 else "image sizes", _sizes(sizes))
     table.add_row("alpha", "known" if capture.alphas is not None else "unknown")
     table.add_row("colours", "linear" if capture.encoding == "linear" else "sRGB-encoded, as stored")
     if capture.points is not None:
@@ -149,7 +156,9 @@ def capture_table(name: str, capture: Capture) -> Table:
     if capture.surroundings > 1.0:
         table.add_row("surroundings", f"{capture.surroundings:.3g} times as large")
     if capture.valid is not None:
-        table.add_row("masked", f"{100.0 * float((~capture.valid).float().mean()):.1f} % of the pixels")
+        table.add_row("masked", f"{100.0 * _masked_share(capture.valid):.1f} % of the pixels")
+    if (reason := why_degenerate(capture)) is not None:
+        table.add_row("degenerate", reason)
     table.add_row("density unit", f"{capture.density_unit:g} per unit length")
     return table
 
@@ -204,6 +213,22 @@ def _table(title: str) -> Table:
     table.add_column(style="bold")
     table.add_column(overflow="fold")
     return table
+
+
+def _sizes(sizes: list[tuple[tuple[int, int], int]]) -> str:
+    """The sizes in pixels that views have, the most frequent first, each with the number of its views."""
+    if len(sizes) == 1:
+        (width, height), _ = sizes[0]
+        return f"{width} x {height}"
+    shown = [f"{width} x {height} ({counted(count, 'view')})" for (width, height), count in sizes[:_SIZES_SHOWN]]
+    others = len(sizes) - len(shown)
+    return ", ".join([*shown, counted(others, "other size")] if others else shown)
+
+
+def _masked_share(valid: Masks) -> float:
+    """Share of all views' pixels that are not valid."""
+    masks = [valid[view] for view in range(len(valid))]
+    return sum(int((~mask).sum()) for mask in masks) / sum(mask.numel() for mask in masks)
 
 
 def _point(values: list[float]) -> str:

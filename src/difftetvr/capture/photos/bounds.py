@@ -29,7 +29,7 @@ _THINNEST = 0.25  # of the longest side, where surroundings are measured
 _PARALLEL = 1e-3
 
 
-def hull_bounds(cameras: Sequence[Camera], masks: torch.Tensor | None) -> Floats:
+def hull_bounds(cameras: Sequence[Camera], masks: Sequence[torch.Tensor] | None) -> Floats:
     """(2, 3) box of the cells of a grid that no silhouette rules out.
 
     The cells that the visual hull keeps are split until their box has 48 cells along its longest side, and padded by
@@ -37,7 +37,7 @@ def hull_bounds(cameras: Sequence[Camera], masks: torch.Tensor | None) -> Floats
 
     Args:
         cameras: N cameras.
-        masks: (N, H, W) bool silhouettes. None: the box of what at least half of the views see.
+        masks: N silhouettes, (H, W) bool. None: the box of what at least half of the views see.
 
     Raises:
         CaptureError: Nothing is left, or the cameras do not say where the scene is.

@@ -9,6 +9,7 @@ import numpy as np
 
 from difftetvr.errors import CaptureError
 
+_FARTHEST = 1e12  # pixels, and more than any distortion: what is farther overflows later
 _NEWTON_STEPS = 30
 _NEWTON_TOLERANCE = 1e-10
 
@@ -187,12 +188,17 @@ class Lens:
         fy = fy if fy is not None else fx
         if fx is None or fy is None:
             raise CaptureError(f"The camera of {where} has no focal length; give one.")
-        if not (math.isfinite(fx) and math.isfinite(fy) and fx > 0 and fy > 0):
-            raise CaptureError(f"The focal lengths of {where} are ({fx}, {fy}) pixels; both must be greater than 0.")
+        if not (0 < fx <= _FARTHEST and 0 < fy <= _FARTHEST):
+            raise CaptureError(
+                f"The focal lengths of {where} are ({fx:g}, {fy:g}) pixels; both must be greater than 0, and no more "
+                "than a lens has."
+            )
         cx = self.cx if self.cx is not None else 0.5 * width
         cy = self.cy if self.cy is not None else 0.5 * height
-        if not all(math.isfinite(v) for v in (cx, cy, *astuple(self.distortion))):
-            raise CaptureError(f"The principal point or distortion of {where} is not finite; correct the file.")
+        if not all(abs(v) <= _FARTHEST for v in (cx, cy, *astuple(self.distortion))):
+            raise CaptureError(
+                f"The principal point or distortion of {where} is not finite or far too large; correct the file."
+            )
         return Intrinsics(fx, fy, cx, cy, width, height, self.distortion)
 
 

@@ -11,25 +11,29 @@ import torch
 
 from difftetvr.capture.capture import Capture
 from difftetvr.capture.hull import silhouettes
-from difftetvr.capture.packed import PackedImages
+from difftetvr.capture.packed import Images
 from difftetvr.capture.photos.bounds import hull_bounds, point_bounds, require_resolved, require_seen, surroundings_of
 from difftetvr.capture.photos.photo_load import fitting_downscale, load_photos, make_camera, present_views
 from difftetvr.capture.photos.photo_set import PhotoSet, read_json
 from difftetvr.capture.photos.readers.camera_list import CAMERAS_FORMAT, read_camera_list
-from difftetvr.capture.photos.readers.colmap import find_colmap_model, read_colmap
+from difftetvr.capture.photos.readers.colmap import colmap_models, read_colmap
+from difftetvr.capture.photos.readers.foreign import known_export
+from difftetvr.capture.photos.readers.phone_apps import is_polycam, is_record3d, read_polycam, read_record3d
 from difftetvr.capture.photos.readers.tiny_nerf import is_tiny_nerf, read_tiny_nerf
 from difftetvr.capture.photos.readers.transforms import read_nerf_synthetic, read_transforms
 from difftetvr.capture.volumes.readers.table import is_volume_file
 from difftetvr.errors import CaptureError
 from difftetvr.rendering.cameras.pinhole import Camera
 
-PhotoFormat = Literal["nerf-synthetic", "transforms", "colmap", "cameras", "tiny-nerf"]
+PhotoFormat = Literal["nerf-synthetic", "transforms", "colmap", "cameras", "tiny-nerf", "polycam", "record3d"]
 
 _READERS = {
     "nerf-synthetic": read_nerf_synthetic,
     "transforms": read_transforms,
     "colmap": read_colmap,
     "cameras": read_camera_list,
+    "polycam": read_polycam,
+    "record3d": read_record3d,
 }
 # Every 8th view, the convention since mip-NeRF 360.
 _TEST_EVERY = 8
@@ -149,8 +153,8 @@ class PhotoCapture:
         self,
         photo_set: PhotoSet,
         cameras: list[Camera],
-        images: torch.Tensor | PackedImages,
-        alphas: torch.Tensor | PackedImages | None,
+        images: Images,
+        alphas: Images | None,
         test: torch.Tensor,
     ) -> tuple[torch.Tensor, float]:
         """(2, 3) float32 bounds, and the surroundings' factor; only images for training are looked at."""
@@ -169,13 +173,15 @@ class PhotoCapture:
             box = photo_set.rough_bounds
         else:
             box = hull_bounds(seeing, None)
+        with np.errstate(over="ignore"):
+            corners = box.astype(np.float32)
         surroundings = 1.0
-        if np.isfinite(box).all() and (box[0] < box[1]).all():
+        if np.isfinite(corners).all() and (box[0] < box[1]).all():
             # A box that is given may be of something that few cameras look at.
             require_seen(box, seeing, photo_set.name, most_blind=0.5 if self.bounds is None else 0.75)
             require_resolved(box, photo_set.name)
             surroundings = 1.0 if masks is not None else surroundings_of(box, seeing)
-        return torch.from_numpy(box.astype(np.float32)), surroundings
+        return torch.from_numpy(corners), surroundings
 
 
 def is_photo_source(source: str | Path) -> bool:
@@ -203,12 +209,18 @@ def find_format(path: Path) -> PhotoFormat:
             return "transforms"
         if _is_camera_list(path / "cameras.json"):
             return "cameras"
-        if find_colmap_model(path) is not None:
+        if colmap_models(path):
             return "colmap"
+        if is_polycam(path):
+            return "polycam"
+        if is_record3d(path):
+            return "record3d"
     elif path.suffix.lower() == ".json":
         return "cameras" if _is_camera_list(path) else "transforms"
     elif path.suffix.lower() == ".npz":
         return "tiny-nerf"
+    if (export := known_export(path)) is not None:
+        raise CaptureError(f"'{path}' {export}.")
     raise CaptureError(
         f"'{path}' holds no capture that is known: neither transforms.json, transforms_train.json, a sparse model of "
         "COLMAP nor our cameras.json; see docs/captures.md."
@@ -223,4 +235,5 @@ def _is_camera_list(path: Path) -> bool:
 
 
 def _tensor(values: np.ndarray | None) -> torch.Tensor | None:
-    return None if values is None else torch.from_numpy(values.astype(np.float32))
+    with np.errstate(over="ignore"):  # what float32 cannot hold is refused as not finite
+        return None if values is None else torch.from_numpy(values.astype(np.float32))

@@ -4,43 +4,52 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextvars import copy_context
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 import torch
 
-from difftetvr.capture.packed import PackedImages
-from difftetvr.capture.photos.image_file import image_size, read_image, read_mask
+from difftetvr.capture.packed import Images, Masks, MixedImages, PackedImages
+from difftetvr.capture.photos.image_file import ImageHeader, image_header, read_image, read_mask
 from difftetvr.capture.photos.lens import Intrinsics
 from difftetvr.capture.photos.photo_set import CaptureWarning, PhotoSet, View
 from difftetvr.capture.photos.undistort import pinhole_of, undistorted, undistorted_mask
 from difftetvr.errors import CameraError, CaptureError
 from difftetvr.rendering.cameras.pinhole import Camera
+from difftetvr.trust import UNPACKED_BYTES, free_memory, require_free
 
 _MOST_WORKERS = 8
+_BYTES_OF_UNDISTORTING = 100  # a pixel: the grid in float64 and what it is made of, the image and its linear light
+_BYTES_OF_READING = 32  # a pixel: the image as float32, its bytes, its mask
 _SMALLEST_COPY = 64  # of the smaller copies that are looked for
 # Sides that differ by less are cropped: COLMAP's undistorter gives every image a size of its own.
 _CROPPED_SHARE, _CROPPED_PIXELS = 0.01, 2
 
 
+_Arrays: TypeAlias = np.ndarray | list[np.ndarray]
+
+
 @dataclass(frozen=True, eq=False)
 class Photos:
-    """Images in memory, all of one size, with their cameras.
+    """Images in memory, with their cameras.
 
     Attributes:
         cameras: N pinhole cameras.
-        images: (N, H, W, 3) as stored in the files, premultiplied over black.
-        alphas: (N, H, W), None where all images are opaque.
-        valid: (N, H, W) bool, None where no pixel is masked.
+        images: (N, H, W, 3) as stored in the files, premultiplied over black, or of several sizes.
+        alphas: (N, H, W) likewise, None where all images are opaque.
+        valid: (N, H, W) bool likewise, None where no pixel is masked.
     """
 
     cameras: list[Camera]
-    images: PackedImages
-    alphas: PackedImages | None
-    valid: torch.Tensor | None
+    images: Images
+    alphas: Images | None
+    valid: Masks | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,10 +58,18 @@ class _Plan:
 
     view: View
     shrink: int
-    mask_shrink: int
+    mask_shrinks: tuple[int, ...]
     lens: Intrinsics
     pinhole: Intrinsics
     file: Path
+    header: ImageHeader
+
+    @property
+    def working_bytes(self) -> int:
+        """Memory that loading it takes for a while."""
+        pixels = self.lens.width * self.lens.height
+        per_pixel = _BYTES_OF_READING if self.lens == self.pinhole else _BYTES_OF_UNDISTORTING
+        return self.header.decoding_bytes(self.shrink) + per_pixel * pixels
 
 
 def load_photos(photo_set: PhotoSet, downscale: int) -> Photos:
@@ -63,36 +80,69 @@ def load_photos(photo_set: PhotoSet, downscale: int) -> Photos:
         downscale: Pixels of the original along x and y that become one.
 
     Raises:
-        CaptureError: An image cannot be read, or sizes do not fit.
+        CaptureError: An image cannot be read, sizes do not fit, or there is not enough memory.
     """
     plans = [_plan(view, downscale) for view in photo_set.views]
-    width, height = _common_size([plan.pinhole for plan in plans], photo_set)
-    cameras = [_camera(plan, width, height) for plan in plans]
-    images = np.empty((len(plans), height, width, 3), dtype=np.uint8)
-    alphas, valid = None, None
-    workers = min(_MOST_WORKERS, os.cpu_count() or 1)
+    _warn_of_16_bits(plans, photo_set)
+    sizes = _sizes([plan.pinhole for plan in plans], photo_set)
+    cameras = [_camera(plan, size) for plan, size in zip(plans, sizes, strict=True)]
+    channels = 3 + (0 if all(plan.view.mask is None for plan in plans) else 1)
+    pixels = sum(width * height for width, height in sizes)
+    advice = "shrink them more with a larger downscale"
+    require_free(channels * pixels, f"The images of '{photo_set.name}'", advice, CaptureError)
+    images = _arrays(sizes, 3, 0)
+    alphas: _Arrays | None = None
+    valid: _Arrays | None = None
+    for index, (values, mask) in enumerate(_loaded(plans)):
+        width, height = sizes[index]
+        images[index][...] = values[:height, :width, :3]
+        if values.shape[2] == 4:
+            alphas = _arrays(sizes, 0, 255) if alphas is None else alphas
+            alphas[index][...] = values[:height, :width, 3]
+        if mask is not None:
+            valid = _arrays(sizes, 0, 1) if valid is None else valid
+            valid[index][...] = mask[:height, :width]
+    if alphas is not None and all((alpha == 255).all() for alpha in alphas):
+        alphas = None
+    return Photos(cameras, _packed(images), None if alphas is None else _packed(alphas), _as_masks(valid))
+
+
+def _loaded(plans: Sequence[_Plan]) -> Iterator[tuple[np.ndarray, np.ndarray | None]]:
+    """What :func:`_load` gives of each plan, in order; as many at a time as cores and memory allow."""
+    largest = max(plan.working_bytes for plan in plans)
+    decoded = max(plan.header.decoding_bytes(plan.shrink) for plan in plans)
+    room = min(free_memory() // 2 // largest, UNPACKED_BYTES // decoded)
+    workers = max(1, min(_MOST_WORKERS, os.cpu_count() or 1, room))
     # Images are the unit of parallel work: torch's own threads would only fight for the same cores.
     with ThreadPoolExecutor(workers, initializer=torch.set_num_threads, initargs=(1,)) as pool:
         try:
-            for index, (values, mask) in enumerate(pool.map(_load, plans)):
-                images[index] = values[:height, :width, :3]
-                if values.shape[2] == 4:
-                    alphas = np.full(images.shape[:3], 255, dtype=np.uint8) if alphas is None else alphas
-                    alphas[index] = values[:height, :width, 3]
-                if mask is not None:
-                    valid = np.ones(images.shape[:3], dtype=np.bool_) if valid is None else valid
-                    valid[index] = mask[:height, :width]
+            # How far files are trusted is known to the caller's context only, and one thread may be in a context.
+            waiting = deque(pool.submit(copy_context().run, _load, plan) for plan in plans)
+            while waiting:
+                yield waiting.popleft().result()
         finally:
             # After an error nobody waits for the other images.
             pool.shutdown(cancel_futures=True)
-    if alphas is not None and (alphas == 255).all():
-        alphas = None
-    return Photos(
-        cameras,
-        PackedImages(torch.from_numpy(images)),
-        None if alphas is None else PackedImages(torch.from_numpy(alphas)),
-        None if valid is None else torch.from_numpy(valid),
-    )
+
+
+def _arrays(sizes: Sequence[tuple[int, int]], channels: int, fill: int) -> _Arrays:
+    """Bytes of all views: one array where these have one size, else one for each; without channels, of pixels."""
+    shapes = [(height, width, channels)[: 3 if channels else 2] for width, height in sizes]
+    if len(set(shapes)) == 1:
+        return np.full((len(shapes), *shapes[0]), fill, dtype=np.uint8)
+    return [np.full(shape, fill, dtype=np.uint8) for shape in shapes]
+
+
+def _packed(arrays: _Arrays) -> PackedImages | MixedImages:
+    if isinstance(arrays, np.ndarray):
+        return PackedImages(torch.from_numpy(arrays))
+    return MixedImages(tuple(map(torch.from_numpy, arrays)))
+
+
+def _as_masks(arrays: _Arrays | None) -> Masks | None:
+    if arrays is None or isinstance(arrays, np.ndarray):
+        return None if arrays is None else torch.from_numpy(arrays.view(np.bool_))
+    return MixedImages(tuple(torch.from_numpy(array.view(np.bool_)) for array in arrays))
 
 
 def present_views(photo_set: PhotoSet, downscale: int) -> list[View]:
@@ -119,24 +169,21 @@ def present_views(photo_set: PhotoSet, downscale: int) -> list[View]:
 
 
 def fitting_downscale(photo_set: PhotoSet, longest_side: int) -> int:
-    """The least downscale with which the first image there is has at most so many pixels along its longer side.
+    """The least downscale with which all images have at most so many pixels along their longer side.
 
     Args:
         photo_set: What a reader found.
         longest_side: Pixels, >= 1.
 
     Raises:
-        CaptureError: The image cannot be read.
+        CaptureError: An image cannot be read.
     """
-    for view in photo_set.views:
-        for downscale in range(1, _SMALLEST_COPY + 1):
-            found = view.file(downscale)
-            if found is None:
-                continue
-            file, factor = found
-            least = -(-factor * max(image_size(file)) // longest_side)
-            # Smaller copies may be all there is, and only serve multiples of their factor.
-            return downscale * max(1, -(-least // downscale))
+    # Smaller copies may be all there is, and only serve multiples of their factor.
+    for downscale in range(1, _SMALLEST_COPY + 1):
+        found = [place for view in photo_set.views if (place := view.file(downscale)) is not None]
+        if found:
+            most = max(factor * max(image_header(file).size) for file, factor in found)
+            return downscale * max(1, -(-most // (longest_side * downscale)))
     return 1
 
 
@@ -158,7 +205,8 @@ def _plan(view: View, downscale: int) -> _Plan:
     if found is None:
         raise CaptureError(f"The image {view.label} is missing; get the capture anew.")
     file, factor = found
-    size = image_size(file)
+    header = image_header(file)
+    size = header.size
     full = (view.lens.width or size[0] * factor, view.lens.height or size[1] * factor)
     # A smaller copy's size is rounded one way or the other.
     if any(abs(stored * factor - meant) >= factor for stored, meant in zip(size, full, strict=True)):
@@ -170,53 +218,56 @@ def _plan(view: View, downscale: int) -> _Plan:
     if min(size) < shrink:
         raise CaptureError(f"The image '{file}' has {size[0]} x {size[1]} pixels, too few to shrink by {shrink}.")
     lens = view.lens.on(*full, view.label).resized(*size).shrunk(shrink)
-    return _Plan(view, shrink, downscale, lens, pinhole_of(lens, view.label), file)
+    # Masks may be of the photographs, or shrunk as their smaller copies are.
+    return _Plan(view, shrink, (downscale, shrink), lens, pinhole_of(lens, view.label), file, header)
 
 
 def _load(plan: _Plan) -> tuple[np.ndarray, np.ndarray | None]:
     """(H, W, 3 or 4) uint8 values of a view, and its (H, W) mask, if it has one."""
     image = read_image(plan.file, plan.shrink)
-    mask = None if plan.view.mask is None else _load_mask(plan)
+    mask = None if plan.view.mask is None else _load_mask(plan, plan.view.mask)
     if plan.lens != plan.pinhole:
         image = undistorted(image, plan.lens, plan.pinhole)
         mask = None if mask is None else undistorted_mask(mask, plan.lens, plan.pinhole)
     return (image * 255.0).round_().to(torch.uint8).numpy(), None if mask is None else mask.numpy()
 
 
-def _load_mask(plan: _Plan) -> torch.Tensor:
-    assert plan.view.mask is not None
-    mask = read_mask(plan.view.mask, plan.mask_shrink)
-    if mask.shape != (plan.lens.height, plan.lens.width):
-        raise CaptureError(
-            f"The mask '{plan.view.mask}' has another size than its image {plan.view.label}; make them equal."
+def _load_mask(plan: _Plan, path: Path) -> torch.Tensor:
+    for shrink in plan.mask_shrinks:
+        mask = read_mask(path, (plan.lens.width, plan.lens.height), shrink)
+        if mask is not None:
+            return mask
+    raise CaptureError(f"The mask '{path}' has another size than its image {plan.view.label}; make them equal.")
+
+
+def _warn_of_16_bits(plans: Sequence[_Plan], photo_set: PhotoSet) -> None:
+    deep = [plan.view.label for plan in plans if plan.header.has_16_bits]
+    if deep:
+        warnings.warn(
+            f"{len(deep)} of the images of '{photo_set.name}', such as {deep[0]}, have 16 bits a channel; 8 are kept.",
+            CaptureWarning,
+            stacklevel=3,
         )
-    return mask
 
 
-def _common_size(sizes: Sequence[Intrinsics], photo_set: PhotoSet) -> tuple[int, int]:
-    """Width and height that all images are cropped to."""
-    common = []
-    for side in ("width", "height"):
-        pixels = [getattr(size, side) for size in sizes]
-        least, most = min(pixels), max(pixels)
-        if most - least > max(_CROPPED_PIXELS, _CROPPED_SHARE * most):
-            one, other = (photo_set.views[pixels.index(value)].label for value in (least, most))
-            raise CaptureError(
-                f"The images of '{photo_set.name}' have different sizes: {one} has a {side} of {least} pixels, {other} "
-                f"of {most}; give images of one size."
-            )
-        common.append(least)
-    cropped = sum((size.width, size.height) != tuple(common) for size in sizes)
+def _sizes(intrinsics: Sequence[Intrinsics], photo_set: PhotoSet) -> list[tuple[int, int]]:
+    """Width and height of each view: one that all are cropped to where they nearly agree, else those that they have."""
+    sizes = [(lens.width, lens.height) for lens in intrinsics]
+    common = (min(width for width, _ in sizes), min(height for _, height in sizes))
+    most = (max(width for width, _ in sizes), max(height for _, height in sizes))
+    if any(high - low > max(_CROPPED_PIXELS, _CROPPED_SHARE * high) for low, high in zip(common, most, strict=True)):
+        return sizes
+    cropped = sum(size != common for size in sizes)
     if cropped:
         warnings.warn(
             f"The images of '{photo_set.name}' differ in size by a few pixels; {cropped} are cropped at the right and "
             f"bottom to {common[0]} x {common[1]}.",
             CaptureWarning,
-            stacklevel=2,
+            stacklevel=3,
         )
-    return common[0], common[1]
+    return [common] * len(sizes)
 
 
-def _camera(plan: _Plan, width: int, height: int) -> Camera:
-    cropped = replace(plan.pinhole, width=width, height=height)
+def _camera(plan: _Plan, size: tuple[int, int]) -> Camera:
+    cropped = replace(plan.pinhole, width=size[0], height=size[1])
     return make_camera(cropped, torch.from_numpy(plan.view.world_to_camera), plan.view.label)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import os
+import reprlib
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,6 +16,9 @@ from difftetvr.capture.photos.image_file import SUFFIXES
 from difftetvr.capture.photos.lens import Lens
 from difftetvr.errors import CaptureError
 from difftetvr.errors import CaptureWarning as CaptureWarning
+from difftetvr.trust import file_beside, require_regular
+
+_MOST_PIXELS = 2**20  # of a side: beyond, it is no image
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,7 +26,9 @@ class View:
     """One photograph and its camera.
 
     Attributes:
-        root: Folder of the images; smaller copies may lie beside it in folders with ``_2``, ``_4``, ... appended.
+        owner: The file that names the image, or the folder of the capture: the image must lie there.
+        root: Folder of the images; smaller copies may lie beside it in folders with ``_2``, ``_4``, ... appended, but
+            not beside the owner's own folder.
         name: Path of the image inside ``root``; a suffix may be missing.
         world_to_camera: (4, 4) float64 rigid transform to OpenCV axes.
         lens: Intrinsics as the file gives them.
@@ -29,6 +36,7 @@ class View:
         mask: File that is black where pixels are not to be used, None for none.
     """
 
+    owner: Path
     root: Path
     name: str
     world_to_camera: np.ndarray
@@ -45,14 +53,51 @@ class View:
         """The image's file that is nearest to a downscaling, and how much smaller than the original it is.
 
         Smaller copies are used if their factor divides ``downscale``. None stands for a missing image.
+
+        Raises:
+            CaptureError: It lies outside of the owner's folder, perhaps by a link, where that is not allowed.
         """
         for factor in range(downscale, 0, -1):
-            if downscale % factor == 0:
-                root = self.root if factor == 1 else self.root.with_name(f"{self.root.name}_{factor}")
-                path = _image_in(root, self.name)
-                if path is not None:
-                    return path, factor
+            root = self._root_of(factor) if downscale % factor == 0 else None
+            path = None if root is None else _image_in(root, self.name)
+            if path is not None:
+                file_beside(self.owner, os.path.abspath(path), CaptureError)
+                return path, factor
         return None
+
+    def _root_of(self, factor: int) -> Path | None:
+        if factor == 1:
+            return self.root
+        folder = self.owner if self.owner.is_dir() else self.owner.parent
+        has_place = self.root.name and self.root != folder
+        return self.root.with_name(f"{self.root.name}_{factor}") if has_place else None
+
+
+def image_place(owner: Path, name: str, where: str) -> tuple[Path, str]:
+    """Folder of the images and path of an image inside it, from a path that a file gives.
+
+    The first folder of the path is the one that smaller copies lie beside.
+
+    Args:
+        owner: The file that names the image.
+        name: Its path, relative to the owner's folder or absolute.
+        where: What names it, for messages.
+
+    Raises:
+        CaptureError: It is no path of a file, or lies outside of the owner's folder, where that is not allowed.
+    """
+    plain = Path(name.replace("\\", "/"))
+    if not plain.name:
+        raise CaptureError(f"{where[0].upper()}{where[1:]} names the image {shown(name)}; give the path of a file.")
+    file_beside(owner, name, CaptureError)
+    folder = owner.parent
+    if plain.is_absolute():
+        resolved, inside = Path(os.path.realpath(plain.parent)), Path(os.path.realpath(folder))
+        if not resolved.is_relative_to(inside):
+            return plain.parent, plain.name
+        plain = resolved.relative_to(inside) / plain.name
+    root, *rest = plain.parts
+    return (folder / root, str(Path(*rest))) if rest else (folder, root)
 
 
 @dataclass(eq=False)
@@ -86,6 +131,7 @@ def read_json(path: Path) -> dict[str, Any]:
     Raises:
         CaptureError: The file is missing or no JSON object.
     """
+    require_regular(path, CaptureError)
     try:
         content = json.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
@@ -118,7 +164,7 @@ def text_of(content: dict[str, Any], key: str, where: str) -> str:
     """
     value = content.get(key)
     if not isinstance(value, str) or not value or "\0" in value:
-        raise CaptureError(f"'{key}' of {where} is {value!r}; give the path of an image.")
+        raise CaptureError(f"'{key}' of {where} is {shown(value)}; give the path of an image.")
     return value
 
 
@@ -126,38 +172,57 @@ def number_of(content: dict[str, Any], key: str, where: str) -> float | None:
     """A finite number of a JSON object; None where it is missing.
 
     Raises:
-        CaptureError: It is no finite number.
+        CaptureError: It is no finite number, or larger than a float can be.
     """
     value = content.get(key)
     if value is None:
         return None
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise CaptureError(f"'{key}' of {where} is {value!r}; give a finite number.")
-    return float(value)
+    numbers = numbers_of(None if isinstance(value, bool) or not isinstance(value, int | float) else value)
+    if numbers.size != 1 or not math.isfinite(numbers):
+        raise CaptureError(f"'{key}' of {where} is {shown(value)}; give a finite number.")
+    return float(numbers)
 
 
 def pixels_of(content: dict[str, Any], key: str, where: str) -> int | None:
     """A positive whole number of a JSON object, which may be written as a float; None where it is missing.
 
     Raises:
-        CaptureError: It is no such number.
+        CaptureError: It is no such number, or of more pixels than an image has.
     """
     value = number_of(content, key, where)
     if value is None:
         return None
-    if value != int(value) or value < 1:
-        raise CaptureError(f"'{key}' of {where} is {value:g}; give a whole number of pixels, at least 1.")
+    if value != int(value) or not 1 <= value <= _MOST_PIXELS:
+        raise CaptureError(
+            f"'{key}' of {where} is {value:g}; give a whole number of pixels, at least 1 and at most {_MOST_PIXELS:,}."
+        )
     return int(value)
+
+
+def numbers_of(values: object) -> np.ndarray:
+    """float64 array of numbers, or nested lists of them, as JSON has them; empty where they are none."""
+    try:
+        return np.array([] if values is None else values, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):  # integers of JSON may be larger than any float
+        return np.empty(0)
+
+
+def shown(value: object) -> str:
+    """A value as a message shows it: shortened."""
+    return reprlib.repr(value)
 
 
 def _image_in(root: Path, name: str) -> Path | None:
     path = root / name
-    if path.is_file():
+    # Not Path.is_file, which raises where a name is too long.
+    if os.path.isfile(path):
         return path
+    if not path.name:
+        return None
     # Blender's files leave the suffix out, and smaller copies may have another one.
     stem = path.with_suffix("") if path.suffix.lower() in SUFFIXES else path
     for suffix in SUFFIXES:
         for candidate in (stem.with_name(stem.name + suffix), stem.with_name(stem.name + suffix.upper())):
-            if candidate.is_file():
+            if os.path.isfile(candidate):
                 return candidate
     return None

@@ -24,7 +24,7 @@ def pose_matrix(values: object, where: str) -> np.ndarray:
     """
     try:
         matrix = np.array(values, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):  # integers of JSON may be larger than any float
         matrix = np.empty(0)
     if matrix.shape not in ((4, 4), (3, 4)):
         raise CaptureError(f"The pose of {where} is no 4 x 4 matrix of numbers; correct the file.")

@@ -6,6 +6,7 @@ import torch
 
 from difftetvr.backend import default_device, get_backend
 from difftetvr.capture.capture import Capture
+from difftetvr.capture.degenerate import why_degenerate
 from difftetvr.errors import CaptureError, FitError
 from difftetvr.fitting.config import FitConfig
 from difftetvr.fitting.metrics import SSIM_WINDOW
@@ -18,13 +19,16 @@ def require_fittable(capture: Capture, config: FitConfig, strategy: Strategy | N
     """Checks what can be known before the first iteration.
 
     Raises:
-        CaptureError: The images have no alpha but the background needs it, or are too small for the loss.
+        CaptureError: The images have no alpha but the background needs it, are too small for the loss, or say nothing
+            about the shape of a scene.
         FitError: The device does not exist or cannot move vertices, or a strategy would refine a field on cells.
         BackendError: No back end works, or the device has none.
     """
     if strategy is not None and config.location == "cell":
         raise FitError("A field on cells cannot be refined; put it on vertices (location vertex), or do not refine.")
-    height, width = capture.images.shape[1:3]
+    if (reason := why_degenerate(capture)) is not None:
+        raise CaptureError(reason)
+    width, height = min(capture.image_sizes, key=min)
     if config.loss == "l1-ssim" and min(height, width) < SSIM_WINDOW:
         raise CaptureError(
             f"The images of '{capture.name}' have {width} x {height} pixels, fewer than the {SSIM_WINDOW} that SSIM "

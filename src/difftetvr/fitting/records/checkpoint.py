@@ -203,11 +203,11 @@ def _unreadable(source: str | Path, why: str) -> FitError:
 
 def describe_capture(capture: Capture) -> dict[str, Any]:
     """What tells one set of images from another: numbers that are compared when a run is resumed."""
-    count, height, width, _ = capture.images.shape
+    widths, heights = (sorted(set(sides)) for sides in zip(*capture.image_sizes, strict=True))
     return {
-        "views": count,
-        "width": width,
-        "height": height,
+        "views": len(capture.cameras),
+        "width": widths[0] if len(widths) == 1 else widths,
+        "height": heights[0] if len(heights) == 1 else heights,
         "test_views": capture.test_indices.tolist(),
         "density_unit": float(capture.density_unit),
         "mean_radiance": float(capture.images.mean(dtype=torch.float64)),

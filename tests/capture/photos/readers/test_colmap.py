@@ -97,6 +97,43 @@ def test_every_place_of_a_model(tmp_path: Path) -> None:
     check_views(load_capture(tmp_path), poses)
 
 
+@pytest.mark.parametrize("suffix", [".bin", ".txt"])
+def test_the_model_with_the_most_images_is_read(tmp_path: Path, suffix: str) -> None:
+    poses = write_colmap(tmp_path, suffix)
+    sparse = tmp_path / "sparse"
+    (sparse / "0").rename(sparse / "10")
+    for name, images in (("0", ""), ("2", "# none\n")):
+        (sparse / name).mkdir()
+        (sparse / name / "cameras.txt").write_text(f"7 PINHOLE {WIDTH} {HEIGHT} 50 50 30 20\n")
+        (sparse / name / "images.txt").write_text(images)
+    for folder in (tmp_path, sparse):
+        with pytest.warns(
+            CaptureWarning, match=r"Of 3 sparse models, .*10' with 16 images is read; not .*0' .0."
+        ) as said:
+            check_views(load_capture(folder), poses)
+        assert len(said) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_views(load_capture(sparse / "10"), poses)
+
+
+def test_masks_beside_the_images(tmp_path: Path) -> None:
+    write_colmap(tmp_path)
+    mask = np.full((HEIGHT, WIDTH), 255, dtype=np.uint8)
+    mask[:, :9] = 0
+    names = [f"{i:03}.png.png" for i in range(7)] + [f"{i:03}.png" for i in range(7, 15)]
+    for name in names:
+        save(tmp_path / "masks" / name, mask)
+    with pytest.warns(CaptureWarning, match="1 of the 16 images have no mask"):
+        capture = load_capture(tmp_path)
+    assert capture.valid is not None and capture.valid[15].all()
+    assert all(torch.equal(capture.valid[view], torch.from_numpy(mask > 0)) for view in range(15))
+    shutil.rmtree(tmp_path / "masks")
+    (tmp_path / "masks").mkdir()
+    with pytest.warns(CaptureWarning, match=r"16 of the 16 .* such as 000.png.png; all their pixels are used"):
+        assert load_capture(tmp_path).valid is None
+
+
 def test_smaller_copies_with_other_suffixes_and_rounded_sizes(tmp_path: Path) -> None:
     poses = write_colmap(tmp_path)
     for index in range(16):

@@ -13,6 +13,7 @@ from capture.damage import damaged_copies
 from capture.photos.photo_checks import check_bounds, check_sentence, check_views
 from capture.photos.photo_scene import FOCAL, HEIGHT, WIDTH, dump, opengl, orbit, picture, save, write_nerf_synthetic
 
+from difftetvr import trusting
 from difftetvr.capture import CaptureWarning, PackedImages, load_capture
 from difftetvr.errors import CaptureError
 
@@ -140,6 +141,28 @@ def test_tiny_archives(tmp_path: Path, channels: int) -> None:
     assert torch.allclose(half.images[1], whole, atol=1e-6)
 
 
+def test_integers_of_tiny_archives(tmp_path: Path) -> None:
+    poses = write_tiny(tmp_path / "ball.npz")
+    with np.load(tmp_path / "ball.npz") as archive:
+        content = dict(archive)
+    for kind, most in (("u1", 255), ("<u2", 65535), (">u2", 65535)):
+        np.savez(tmp_path / "ball.npz", **{**content, "images": (content["images"] * most).round().astype(kind)})
+        check_views(load_capture(tmp_path / "ball.npz"), poses)
+    np.savez(tmp_path / "ball.npz", **{**content, "images": content["images"].astype(np.int64)})
+    with pytest.raises(CaptureError, match="are int64; store uint8") as error:
+        load_capture(tmp_path / "ball.npz")
+    check_sentence(error.value)
+
+
+def test_tiny_archives_that_are_not(tmp_path: Path) -> None:
+    """A few kB that become more than a GiB as floats."""
+    arrays = {"images": np.zeros((1, 1, 300 * 2**20, 3), np.uint8)[:, :, :100_000_000], "poses": np.eye(4)[None]}
+    np.savez_compressed(tmp_path / "a.npz", **arrays, focal=np.array(5.0))
+    with pytest.raises(CaptureError, match=r"images as float32 .* 1 GiB; .*--allow-large") as error:
+        load_capture(tmp_path / "a.npz")
+    check_sentence(error.value)
+
+
 def test_wrong_tiny_archives(tmp_path: Path) -> None:
     path = tmp_path / "a.npz"
     for changes, message in (
@@ -167,7 +190,7 @@ def test_real_lego(shared_data: Path, tmp_path: Path) -> None:
         content = json.loads((folder / f"transforms_{split}.json").read_text())
         content["frames"] = content["frames"][:: 4 if split == "train" else 1]
         dump(tmp_path / f"transforms_{split}.json", content)
-    with pytest.warns(CaptureWarning, match="175 of the 200"):
+    with trusting(outside=folder), pytest.warns(CaptureWarning, match="175 of the 200"):
         capture = load_capture(tmp_path, downscale=8)
     assert capture.images.shape == (50, 100, 100, 3) and capture.test.sum() == 25
     lower, upper = capture.bounds.numpy()

@@ -10,7 +10,18 @@ import numpy as np
 import pytest
 import torch
 from capture.photos.photo_checks import check_bounds, check_sentence, check_views, seen_at
-from capture.photos.photo_scene import FOCAL, HEIGHT, WIDTH, dump, orbit, picture, project, save, write_transforms
+from capture.photos.photo_scene import (
+    FOCAL,
+    HEIGHT,
+    POINTS,
+    WIDTH,
+    dump,
+    orbit,
+    picture,
+    project,
+    save,
+    write_transforms,
+)
 
 from difftetvr.capture import CaptureWarning, load_capture
 from difftetvr.errors import CaptureError
@@ -61,6 +72,22 @@ def test_lists_of_file_names_are_the_split(tmp_path: Path) -> None:
         load_capture(tmp_path, test_every=4)
 
 
+def test_lists_of_images_beside_the_file_and_absolute_ones(tmp_path: Path) -> None:
+    poses = write_transforms(tmp_path)
+
+    def rename(content: dict) -> None:
+        for index, frame in enumerate(content["frames"]):
+            name = Path(frame["file_path"]).name
+            (tmp_path / frame["file_path"]).rename(tmp_path / name)
+            frame["file_path"] = name if index % 2 else str(tmp_path / name)
+        content |= {"train_filenames": [f"{i:03}.png" for i in range(4)], "test_filenames": [str(tmp_path / "005.png")]}
+
+    edit(tmp_path, rename)
+    capture = load_capture(tmp_path)
+    check_views(capture, [*poses[:4], poses[5]])
+    assert capture.test_indices.tolist() == [4]
+
+
 def test_instant_ngp_box(tmp_path: Path) -> None:
     write_transforms(tmp_path, suffix=".jpg", aabb_scale=2)
     np.testing.assert_allclose(load_capture(tmp_path).bounds, [[-0.5 / 0.33] * 3, [0.5 / 0.33] * 3], rtol=1e-6)
@@ -81,6 +108,80 @@ def test_bounds_by_the_cameras_alone(tmp_path: Path) -> None:
     assert given.bounds.tolist() == [[-1, -2, -3], [1, 2, 3]]
 
 
+def write_ply(path: Path, kind: str, colors: str | None = "uchar", before: str = "") -> None:
+    """The points of the scene, red, as text or binary, with normals that nobody asked for and faces behind."""
+    properties = [("float", name) for name in ("x", "nx", "y", "z")]
+    properties += [(colors, name) for name in ("red", "green", "blue")] if colors else []
+    lines = ["ply", f"format {kind} 1.0", "comment made for a test", *([before] if before else [])]
+    lines += [f"element vertex {len(POINTS)}", *(f"property {type_} {name}" for type_, name in properties)]
+    header = "\n".join([*lines, "element face 1", "property list uchar int vertex_indices", "end_header\n"]).encode()
+    most = 1.0 if colors == "float" else 255
+    rows = [[x, 0, y, z, *([most, 0, 0] if colors else [])] for x, y, z in POINTS.tolist()]
+    if kind == "ascii":
+        path.write_bytes(header + "\n".join(" ".join(map(str, row)) for row in rows).encode() + b"\n3 0 1 2\n")
+        return
+    order = ">" if "big" in kind else "<"
+    code = {"float": "f4", "uchar": "u1"}
+    records = np.array([tuple(row) for row in rows], [(name, order + code[type_]) for type_, name in properties])
+    path.write_bytes(header + records.tobytes() + b"\3" + np.arange(3, dtype=f"{order}i4").tobytes())
+
+
+@pytest.mark.parametrize("colors", ["uchar", "float", None])
+@pytest.mark.parametrize("kind", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_sparse_points_in_a_ply_file(tmp_path: Path, kind: str, colors: str | None) -> None:
+    write_transforms(tmp_path, suffix=".jpg", ply_file_path="sparse_pc.ply")
+    write_ply(tmp_path / "sparse_pc.ply", kind, colors)
+    capture = load_capture(tmp_path)
+    np.testing.assert_allclose(capture.points, POINTS, atol=1e-6)
+    assert (capture.point_colors is None) == (colors is None)
+    if colors:
+        np.testing.assert_allclose(capture.point_colors, [[1, 0, 0]] * 6)
+    check_bounds(capture)
+
+
+def test_ply_files_that_are_missing_or_damaged(tmp_path: Path) -> None:
+    write_transforms(tmp_path, suffix=".jpg", ply_file_path="sparse_pc.ply")
+    path = tmp_path / "sparse_pc.ply"
+    with pytest.warns(CaptureWarning, match=r"sparse_pc.ply' .* are missing"):
+        assert load_capture(tmp_path).points is None
+    for kind in ("ascii", "binary_little_endian"):
+        write_ply(path, kind)
+        whole = path.read_bytes()
+        for wrong in (
+            whole[:120],
+            whole[: whole.index(b"end_header") + 20],
+            whole.replace(b"vertex 6", b"vertex 60000000000000"),
+            whole.replace(b"vertex 6", b"vertex -6"),
+            whole.replace(b"vertex 6", b"vertex 1e999"),
+            whole.replace(b"vertex 6", b"corner 6"),
+            whole.replace(b" x\n", b" y\n"),
+            whole.replace(b"float x", b"list uchar float x"),
+            whole.replace(b"float x", b"quaternion x"),
+            whole.replace(b"1.0", b"").replace(kind.encode(), b""),
+            b"",
+        ):
+            path.write_bytes(wrong)
+            with pytest.raises(CaptureError, match="no intact PLY file") as error:
+                load_capture(tmp_path)
+            check_sentence(error.value)
+    write_ply(path, "ascii")
+    words = path.read_bytes().split(b"end_header\n")
+    path.write_bytes(words[0] + b"end_header\nnan" + words[1].lstrip(b"-.0123456789"))
+    assert len(load_capture(tmp_path).points) == 5
+    # No colour is that.
+    path.write_bytes(path.read_bytes().replace(b" 255 ", b" nan ", 1))
+    with pytest.raises(CaptureError, match="no intact PLY file"):
+        load_capture(tmp_path)
+
+
+def test_what_is_known_and_not_used_is_said(tmp_path: Path) -> None:
+    write_transforms(tmp_path, rolling_shutter=[0, 0, 0, 1])
+    edit(tmp_path, lambda c: [frame.update(depth_file_path="depth.png") for frame in c["frames"]])
+    with pytest.warns(CaptureWarning, match="depth maps .* and a rolling shutter, not used") as said:
+        load_capture(tmp_path)
+    assert len(said) == 1
+
+
 def test_masks_exclude_pixels(tmp_path: Path) -> None:
     write_transforms(tmp_path)
     mask = np.full((HEIGHT, WIDTH), 255, dtype=np.uint8)
@@ -92,6 +193,11 @@ def test_masks_exclude_pixels(tmp_path: Path) -> None:
     assert torch.equal(capture.valid[0], torch.from_numpy(mask > 0))
     half = load_capture(tmp_path, downscale=2).valid
     assert half is not None and not half[0, :4].any() and half[0, 4:].all()
+    # Masks that are shrunk as the smaller copies of the images are.
+    save(tmp_path / "images_2" / "000.png", picture(orbit()[0])[::2, ::2])
+    save(tmp_path / "masks" / "a.png", mask[::2, ::2])
+    copies = load_capture(tmp_path, downscale=2).valid
+    assert copies is not None and torch.equal(copies[0], torch.from_numpy(mask[::2, ::2] > 0))
     save(tmp_path / "masks" / "a.png", mask[:9])
     with pytest.raises(CaptureError, match=r"mask .* another size"):
         load_capture(tmp_path)

@@ -1,4 +1,4 @@
-"""Which views do the files of a capture describe: NeRF-synthetic, nerfstudio, COLMAP, our own, tiny NeRF?
+"""Which views do the files of a capture describe: those of NeRF, nerfstudio, COLMAP, phones, our own?
 
 Each returns a :class:`~difftetvr.capture.photos.photo_set.PhotoSet`; no image is decoded yet.
 """

@@ -20,13 +20,23 @@ pixels, the centre of the first pixel at (0.5, 0.5). ``test`` and ``bounds`` may
 
 from __future__ import annotations
 
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from difftetvr.capture.photos.lens import Lens
-from difftetvr.capture.photos.photo_set import PhotoSet, View, list_of_objects, number_of, read_json, text_of
+from difftetvr.capture.photos.photo_set import (
+    PhotoSet,
+    View,
+    image_place,
+    list_of_objects,
+    number_of,
+    numbers_of,
+    read_json,
+    shown,
+    text_of,
+)
 from difftetvr.capture.photos.poses import pose_matrix
 from difftetvr.errors import CaptureError
 
@@ -49,31 +59,31 @@ def read_camera_list(path: Path) -> PhotoSet:
             f"'{file}' does not have the format '{CAMERAS_FORMAT}'; see docs/captures.md for what it needs."
         )
     cameras = list_of_objects(content, "cameras", file)
-    views = sorted((_view(file, index, camera) for index, camera in enumerate(cameras)), key=lambda view: view.name)
+    views = sorted(
+        (_view(file, index, camera) for index, camera in enumerate(cameras)),
+        key=lambda view: str(view.root / view.name),
+    )
     has_split = any(view.is_test for view in views) or all("test" in camera for camera in cameras)
     return PhotoSet(file.parent.resolve().name, views, has_split=has_split, bounds=_bounds(content, file))
 
 
 def _view(file: Path, index: int, camera: dict[str, Any]) -> View:
     where = f"camera {index} of '{file}'"
-    name = PurePosixPath(text_of(camera, "image", where).replace("\\", "/"))
+    root, name = image_place(file, text_of(camera, "image", where), where)
     fx, fy, cx, cy = (number_of(camera, key, where) for key in ("fx", "fy", "cx", "cy"))
     if None in (fx, fy, cx, cy):
         raise CaptureError(f"{where[0].upper()}{where[1:]} lacks one of fx, fy, cx and cy; give all four in pixels.")
     is_test = camera.get("test", False)
     if not isinstance(is_test, bool):
-        raise CaptureError(f"'test' of {where} is {is_test!r}; give true or false.")
+        raise CaptureError(f"'test' of {where} is {shown(is_test)}; give true or false.")
     pose = pose_matrix(camera.get("world_to_camera"), where)
-    return View(file.parent, str(name), pose, Lens(fx, fy, cx, cy), is_test)
+    return View(file, root, name, pose, Lens(fx, fy, cx, cy), is_test)
 
 
 def _bounds(content: dict[str, Any], file: Path) -> np.ndarray | None:
     if content.get("bounds") is None:
         return None
-    try:
-        bounds = np.array(content["bounds"], dtype=np.float64)
-    except (TypeError, ValueError):
-        bounds = np.empty(0)
+    bounds = numbers_of(content["bounds"])
     if bounds.shape != (2, 3):
         raise CaptureError(f"'bounds' of '{file}' must be a lower and an upper corner, three numbers each.")
     return bounds

@@ -21,6 +21,7 @@ from difftetvr.capture.photos.readers.colmap_model import (
     parameter_count,
 )
 from difftetvr.errors import CaptureError
+from difftetvr.trust import require_regular
 
 _COUNT = struct.Struct("<Q")
 _CAMERA = struct.Struct("<IiQQ")
@@ -33,10 +34,12 @@ _KEYPOINT = np.dtype([("position", "<f8", 2), ("point", "<i8")])
 class _Reader:
     """Takes records off the start of a file's bytes."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, most: int = -1) -> None:
         self.path = path
+        require_regular(path, CaptureError)
         try:
-            self.data = path.read_bytes()
+            with path.open("rb") as file:
+                self.data = file.read(most)
         except OSError as error:
             raise CaptureError(f"Cannot read '{path}': {error.strerror or error}; check the model's folder.") from None
         self.position = 0
@@ -103,6 +106,15 @@ def read_cameras(path: Path) -> dict[int, Lens]:
         lenses[key] = lens_of(name, (width, height), values, where)
     reader.finish()
     return lenses
+
+
+def count_images(path: Path) -> int:
+    """How many images a file registers, of which no more is read.
+
+    Raises:
+        CaptureError: It cannot be read.
+    """
+    return int(_Reader(path, _COUNT.size).record(_COUNT)[0])
 
 
 def read_images(path: Path) -> list[ColmapImage]:

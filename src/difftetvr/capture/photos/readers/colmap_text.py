@@ -15,6 +15,7 @@ from difftetvr.capture.photos.lens import Lens
 from difftetvr.capture.photos.poses import from_quaternion
 from difftetvr.capture.photos.readers.colmap_model import ColmapImage, ColmapPoints, damaged, lens_of
 from difftetvr.errors import CaptureError
+from difftetvr.trust import require_regular
 
 
 def read_cameras(path: Path) -> dict[int, Lens]:
@@ -30,6 +31,15 @@ def read_cameras(path: Path) -> dict[int, Lens]:
             size = (int(width), int(height))
             lenses[int(key)] = lens_of(model, size, np.array(values, dtype=np.float64), f"camera {key} of '{path}'")
     return lenses
+
+
+def count_images(path: Path) -> int:
+    """How many images a file registers.
+
+    Raises:
+        CaptureError: It cannot be read, or is damaged.
+    """
+    return len(read_images(path))
 
 
 def read_images(path: Path) -> list[ColmapImage]:
@@ -79,6 +89,7 @@ def read_points(path: Path) -> ColmapPoints:
 
 def _lines(path: Path, keep_empty: bool = False) -> Iterator[tuple[int, str]]:
     """Numbers and contents of the lines that are no comments."""
+    require_regular(path, CaptureError)
     try:
         text = path.read_text(encoding="utf-8")
     except OSError as error:

@@ -12,8 +12,11 @@ from difftetvr.archive import array_names, read_arrays
 from difftetvr.capture.photos.lens import Intrinsics, Lens
 from difftetvr.capture.photos.poses import from_opengl
 from difftetvr.errors import CaptureError
+from difftetvr.trust import require_modest
 
 _KEYS = ("images", "poses", "focal")
+# Values of integers that stand for 1.
+_MOST = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0}
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,10 +62,14 @@ def read_tiny_nerf(path: Path, downscale: int = 1) -> TinyNerf:
             f"'{path}' has images of shape {images.shape}, poses of {poses.shape} and {focal.size} focal lengths; "
             "give (N, H, W, 3), (N, 4, 4) and one number."
         )
+    kind = images.dtype.newbyteorder("=")
+    if kind.kind != "f" and kind not in _MOST:
+        raise CaptureError(f"The images of '{path}' are {images.dtype}; store uint8, uint16 or floats from 0 to 1.")
+    require_modest(path, 4 * images.size, "images as float32", CaptureError)
     height, width = images.shape[1] // downscale, images.shape[2] // downscale
     if min(height, width) < 1:
         raise CaptureError(f"The images of '{path}' are too small to shrink by {downscale}.")
-    values = images.astype(np.float32) / (255.0 if images.dtype == np.uint8 else 1.0)
+    values = images.astype(np.float32) / _MOST.get(kind, 1.0)
     has_alpha = values.shape[3] == 4
     if has_alpha:
         values[..., :3] *= values[..., 3:]

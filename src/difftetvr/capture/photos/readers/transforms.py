@@ -6,8 +6,10 @@ docs/nerf_dataset_tips.md of instant-ngp. All three store camera-to-world in Ope
 
 from __future__ import annotations
 
+import os
 import warnings
-from pathlib import Path, PurePosixPath
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,16 +19,27 @@ from difftetvr.capture.photos.photo_set import (
     CaptureWarning,
     PhotoSet,
     View,
+    image_place,
     list_of_objects,
     number_of,
+    numbers_of,
     pixels_of,
     read_json,
+    shown,
     text_of,
 )
 from difftetvr.capture.photos.poses import from_opengl
+from difftetvr.capture.photos.readers.ply_points import read_ply_points
 from difftetvr.errors import CaptureError
+from difftetvr.trust import file_beside
 
 _PINHOLES = ("", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL")
+# What changes nothing here, although the file says it.
+_UNUSED = {
+    "depth_file_path": "depth maps (depth_file_path)",
+    "depth_path": "depth maps (depth_path)",
+    "rolling_shutter": "a rolling shutter",
+}
 # instant-ngp maps positions p to 0.33 p + (0.5, 0.5, 0.5), and its box is a cube of side aabb_scale around the 0.5s.
 _NGP_SCALE, _NGP_OFFSET, _NGP_CENTER = 0.33, 0.5, 0.5
 
@@ -41,7 +54,7 @@ def read_nerf_synthetic(folder: Path) -> PhotoSet:
         CaptureError: A file is missing or not valid.
     """
     training = folder / "transforms_train.json"
-    train = _views(folder, training, read_json(training), is_test=False)
+    train = _views(training, read_json(training), is_test=False)
     for view in train:
         if view.file(1) is None:
             raise CaptureError(
@@ -57,6 +70,7 @@ def read_transforms(path: Path) -> PhotoSet:
 
     Intrinsics may stand at the top or, overriding that, in each frame. Distortion is OpenCV's k1, k2, p1, p2, k3.
     nerfstudio's lists of ``train_filenames`` and ``test_filenames`` (or ``val_filenames``) are kept to.
+    The points of its ``ply_file_path`` are the sparse points.
     Where there is an ``aabb_scale``, the bounds are instant-ngp's unit cube, by its ``scale`` and ``offset``.
     Listed images may be absent, as instant-ngp allows.
 
@@ -68,18 +82,26 @@ def read_transforms(path: Path) -> PhotoSet:
     """
     file = path / "transforms.json" if path.is_dir() else path
     folder, content = file.parent, read_json(file)
-    views = sorted(_views(folder, file, content, is_test=False), key=lambda view: view.name)
+    views = sorted(_views(file, content, is_test=False), key=lambda view: view.name)
+    places = [_place(view.root / view.name) for view in views]
     held_out = _named(content, "test_filenames", file) or _named(content, "val_filenames", file)
-    used = (_named(content, "train_filenames", file) | held_out) or {_plain(view) for view in views}
+    used = (_named(content, "train_filenames", file) | held_out) or set(places)
     views = [
-        View(v.root, v.name, v.world_to_camera, v.lens, _plain(v) in held_out, v.mask)
-        for v in views
-        if _plain(v) in used
+        replace(view, is_test=place in held_out) for view, place in zip(views, places, strict=True) if place in used
     ]
     if not views:
         raise CaptureError(f"The file names that '{file}' lists for training and testing are none of its frames.")
-    name = folder.resolve().name
-    return PhotoSet(name, views, has_split=bool(held_out), may_miss=True, rough_bounds=_box(content, f"'{file}'"))
+    points, colors = _sparse_points(content, file)
+    _warn_of_unused(content, file)
+    return PhotoSet(
+        folder.resolve().name,
+        views,
+        has_split=bool(held_out),
+        may_miss=True,
+        points=points,
+        point_colors=colors,
+        rough_bounds=_box(content, f"'{file}'"),
+    )
 
 
 def _held_out(folder: Path) -> list[View]:
@@ -87,7 +109,7 @@ def _held_out(folder: Path) -> list[View]:
         file = folder / name
         if not file.is_file():
             continue
-        views = _views(folder, file, read_json(file), is_test=True)
+        views = _views(file, read_json(file), is_test=True)
         present = [view for view in views if view.file(1) is not None]
         if len(present) < len(views):
             missing = len(views) - len(present)
@@ -101,17 +123,14 @@ def _held_out(folder: Path) -> list[View]:
     return []
 
 
-def _views(folder: Path, file: Path, content: dict[str, Any], is_test: bool) -> list[View]:
+def _views(file: Path, content: dict[str, Any], is_test: bool) -> list[View]:
     views = []
     for index, frame in enumerate(list_of_objects(content, "frames", file)):
         where = f"frame {index} of '{file}'"
-        name = PurePosixPath(text_of(frame, "file_path", where).replace("\\", "/"))
-        # The first folder of the path is the one that smaller copies lie beside.
-        root = folder / name.parts[0] if len(name.parts) > 1 else folder
-        inside = PurePosixPath(*name.parts[1:]) if len(name.parts) > 1 else name
+        root, name = image_place(file, text_of(frame, "file_path", where), where)
         pose = from_opengl(frame.get("transform_matrix"), where)
-        mask = folder / text_of(frame, "mask_path", where) if frame.get("mask_path") else None
-        views.append(View(root, str(inside), pose, _lens({**content, **frame}, where), is_test, mask))
+        mask = file_beside(file, text_of(frame, "mask_path", where), CaptureError) if frame.get("mask_path") else None
+        views.append(View(file, root, name, pose, _lens({**content, **frame}, where), is_test, mask))
     return views
 
 
@@ -119,7 +138,7 @@ def _lens(values: dict[str, Any], where: str) -> Lens:
     model = values.get("camera_model") or ""
     if values.get("is_fisheye") or not isinstance(model, str) or model.upper() not in _PINHOLES:
         raise CaptureError(
-            f"The camera model of {where} is {model or 'a fisheye'!r}; undistort its images to a pinhole first."
+            f"The camera model of {where} is {shown(model or 'a fisheye')}; undistort its images to a pinhole first."
         )
 
     def number(key: str) -> float | None:
@@ -141,6 +160,29 @@ def _lens(values: dict[str, Any], where: str) -> Lens:
     )
 
 
+def _sparse_points(content: dict[str, Any], file: Path) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Positions and colours from the PLY file that nerfstudio names; None where there is none."""
+    if content.get("ply_file_path") is None:
+        return None, None
+    path = file_beside(file, text_of(content, "ply_file_path", f"'{file}'"), CaptureError)
+    if not path.exists():
+        warnings.warn(
+            f"The sparse points '{path}' that '{file}' names are missing; it is read without.",
+            CaptureWarning,
+            stacklevel=3,
+        )
+        return None, None
+    points, colors = read_ply_points(path)
+    return (points, colors) if len(points) else (None, None)
+
+
+def _warn_of_unused(content: dict[str, Any], file: Path) -> None:
+    frames = list_of_objects(content, "frames", file)
+    unused = [what for key, what in _UNUSED.items() if key in content or any(key in frame for frame in frames)]
+    if unused:
+        warnings.warn(f"'{file}' has {' and '.join(unused)}, not used here.", CaptureWarning, stacklevel=3)
+
+
 def _box(content: dict[str, Any], where: str) -> np.ndarray | None:
     """The unit cube of instant-ngp, where the object should be; None where the file is not for instant-ngp."""
     side = number_of(content, "aabb_scale", where)
@@ -148,13 +190,12 @@ def _box(content: dict[str, Any], where: str) -> np.ndarray | None:
         return None
     scale = number_of(content, "scale", where) or _NGP_SCALE
     offset = content.get("offset", _NGP_OFFSET)
-    try:
-        offsets = np.broadcast_to(np.array(offset, dtype=np.float64), (3,))
-    except (TypeError, ValueError):
-        offsets = np.full(3, np.nan)
-    if side <= 0 or not np.isfinite(offsets).all():
-        raise CaptureError(f"The aabb_scale {side:g} or the offset {offset!r} of {where} is not valid; correct them.")
-    center = (_NGP_CENTER - offsets) / scale
+    offsets = numbers_of(offset)
+    if side <= 0 or offsets.shape not in ((), (3,)) or not np.isfinite(offsets).all():
+        raise CaptureError(
+            f"The aabb_scale {side:g} or the offset {shown(offset)} of {where} is not valid; correct them."
+        )
+    center = (_NGP_CENTER - np.broadcast_to(offsets, (3,))) / scale
     half = 0.5 / abs(scale)
     return np.stack([center - half, center + half])
 
@@ -163,9 +204,9 @@ def _named(content: dict[str, Any], key: str, file: Path) -> set[str]:
     names = content.get(key) or []
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise CaptureError(f"'{key}' of '{file}' is no list of file names; correct or remove it.")
-    return {str(PurePosixPath(name)) for name in names}
+    return {_place(file.parent / name.replace("\\", "/")) for name in names}
 
 
-def _plain(view: View) -> str:
-    """The path of a view's image as nerfstudio's lists of files write it."""
-    return str(PurePosixPath(view.root.name) / view.name)
+def _place(path: Path) -> str:
+    """By which the image of a frame and a name in nerfstudio's lists are compared."""
+    return os.path.abspath(path)
