@@ -8,7 +8,7 @@ from typing import Any
 import drjit as dr
 
 from difftetvr.optics.model import Adjoint, Weights
-from difftetvr.optics.special import constant_density
+from difftetvr.optics.special import constant_density, depth_of
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class SubSegments:
         return w0, w1, transmittance, d_length, length * d_s0, length * d_s1
 
     def _depth(self, i: int, length: Any, s0: Any, s1: Any) -> Any:
-        return length * dr.lerp(s0, s1, (i + 0.5) / self.count) / self.count
+        return depth_of(length, dr.lerp(s0, s1, (i + 0.5) / self.count)) / self.count
 
     def _prefix_transmittances(self, length: Any, s0: Any, s1: Any) -> list[Any]:
         result = [type(length)(1.0)]

@@ -144,9 +144,9 @@ def prepare_view(
     task = RenderTask(backend, mesh, camera, optics, content, transmittance_threshold, deterministic, renderer)
     vertices, unit = _unit_of_length(positions, mesh)
     if unit != 1.0 and content == "scalar":
-        parts = *parts[:2], torch.cat((parts[2][:, :1] * unit, parts[2][:, 1:]), dim=1)
+        parts = *parts[:2], torch.cat((_by_unit(parts[2][:, :1], unit), parts[2][:, 1:]), dim=1)
     elif unit != 1.0:
-        parts = parts[0], parts[1] * unit
+        parts = parts[0], _by_unit(parts[1], unit)
     return PreparedView(task, vertices, parts, unit)
 
 
@@ -217,6 +217,11 @@ def _unit_of_length(vertices: torch.Tensor, mesh: TetMesh) -> tuple[torch.Tensor
         return vertices, 1.0
     unit = 2.0 ** math.frexp(largest)[1]
     return vertices / unit, unit
+
+
+def _by_unit(density: torch.Tensor, unit: float) -> torch.Tensor:
+    """Densities per unit of length; beyond what the precision holds they are as great as it allows, never infinite."""
+    return (density * unit).clamp(max=torch.finfo(density.dtype).max)
 
 
 def _times(values: torch.Tensor, unit: float) -> torch.Tensor:

@@ -71,7 +71,6 @@ def inspect_rays(
 class _Inspected:
     count: Any
     worst: Any
-    transmittance: Any
 
 
 class _InspectionKernel:
@@ -83,7 +82,7 @@ class _InspectionKernel:
 
     def start(self) -> _Inspected:
         real, lanes = self.view.backend.Float, dr.width(self.rays.pixel)
-        return _Inspected(dr.zeros(self.view.backend.Int, lanes), dr.full(real, dr.inf, lanes), dr.ones(real, lanes))
+        return _Inspected(dr.zeros(self.view.backend.Int, lanes), dr.full(real, dr.inf, lanes))
 
     def read(self, vertex: Any, active: Any) -> Corner:
         position, attributes = read_vertex(self.view, vertex, active)
@@ -98,7 +97,10 @@ class _InspectionKernel:
             if self.span.far is not None:
                 met &= step.entry[0] < self.span.far
         count = ray.count + dr.select(met, 1, 0)
-        return _Inspected(count, dr.select(met, dr.fmin(ray.worst, quality), ray.worst), ray.transmittance)
+        return _Inspected(count, dr.select(met, dr.fmin(ray.worst, quality), ray.worst))
+
+    def goes_on(self, ray: _Inspected) -> Any:
+        return dr.mask_t(ray.worst)(True)
 
     def leave(self, face: Face, ray: _Inspected, active: Any) -> _Inspected:
         return ray

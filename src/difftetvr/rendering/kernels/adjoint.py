@@ -219,17 +219,19 @@ class _AdjointKernel:
         length = dr.fmax(t1 - t0, 0.0)
         g0, g1 = q0 * ray.transmittance, q1 * ray.transmittance
         w0, w1, transmittance, d_length, d_s0, d_s1 = self.view.optics.adjoint(length, s0, s1, g0, g1, type(length)(0))
-        rest = ray.rest - dr.fma(w0, g0, w1 * g1)
+        transmittance *= ray.transmittance
+        # Where no light comes through, nothing is left but what rounding has left.
+        rest = dr.select(transmittance > 0, ray.rest - dr.fma(w0, g0, w1 * g1), 0.0)
         # All that is still ahead is seen through this cell: its optical depth L (s0 + s1) / 2 dims the rest.
         half = 0.5 * (rest - self.pixel.optical_depth)
-        d_length = dr.select(t1 > t0, dr.fma(-half, s0 + s1, d_length), 0.0)
+        d_length = dr.select(t1 > t0, dr.fma(-half, s0, dr.fma(-half, s1, d_length)), 0.0)
         d_s0, d_s1 = dr.fma(-half, length, d_s0), dr.fma(-half, length, d_s1)
         w0, w1 = w0 * ray.transmittance, w1 * ray.transmittance
         d_t0, d_t1 = -d_length, d_length
         if far is not None:
             d_t0, d_t1 = dr.fma(far, w0, d_t0), dr.fma(far, w1, d_t1)
         at_start, at_end = [d_t0, d_s0, w0], [d_t1, d_s1, w1]
-        return AdjointRay(ray.transmittance * transmittance, rest, ray.carry, ray.limits), at_start, at_end
+        return AdjointRay(transmittance, rest, ray.carry, ray.limits), at_start, at_end
 
     def _cut(self, start: list[Any], end: list[Any], ray: AdjointRay) -> tuple[AdjointRay, list[Any], list[Any]]:
         """Adjoint of one cell, piece by piece: derivatives with respect to (distance, scalar) at its start and end."""
@@ -246,6 +248,10 @@ class _AdjointKernel:
         zeros = lambda: [dr.zeros_like(ray.rest) for _ in range(2)]  # noqa: E731
         ray, total = transfer.cut(start, end, visit, (ray, CrossingAdjoint(zeros(), zeros())))
         return ray, total.entry, total.leaving
+
+    def goes_on(self, ray: AdjointRay) -> Any:
+        integrates = (self.view.threshold == 0) & (self.pixel.optical_depth != 0)
+        return (ray.transmittance > self.view.threshold) | integrates
 
     def leave(self, face: Face, ray: AdjointRay, active: Any) -> AdjointRay:
         carry = ray.carry[: 1 + self.field_slots]
