@@ -6,27 +6,34 @@ and Metal, in float32 and float64. Only kernel modules and the modules that wrap
 
 from __future__ import annotations
 
+import functools
 import importlib
 import os
 import platform
+import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 import torch
 
 from difftetvr.errors import BackendError
+from difftetvr.inputs import described
 from difftetvr.libllvm import PATH_VARIABLE, tell_drjit
 
 tell_drjit()  # before the first import of Dr.Jit, which looks for libLLVM only then
 
 import drjit as dr  # noqa: E402
 
+Parameters = ParamSpec("Parameters")
+Result = TypeVar("Result")
+
 _DEVICE_BACKENDS = {"cpu": "llvm", "cuda": "cuda", "mps": "metal"}
 _TURN = threading.RLock()
+_FORKED = threading.Event()  # set in copies of a process in which kernels had run
 _DTYPES = {torch.float32: "", torch.float64: "64"}
 
 
@@ -110,7 +117,12 @@ class Backend:
         Args:
             one_thread: Run them on one CPU thread, so that sums over rays are taken in a fixed order. Has no effect on
                 GPUs, whose atomic additions have no order.
+
+        Raises:
+            BackendError: This process was forked from one that had run kernels.
         """
+        require_own_threads()
+        _watch_forks()
         with _TURN:
             threads = dr.thread_count() if one_thread and self.name == "llvm" else 0
             if threads:
@@ -128,23 +140,51 @@ class Backend:
             torch.cuda.current_stream(self.device).synchronize()
 
 
+def eager(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """A function that ``torch.compile`` leaves alone and calls, instead of tracing it down to the kernels.
+
+    :func:`torch.compiler.disable` does that, but imports the compiler, which takes longer than most renderings; so it
+    is called once somebody else has.
+    """
+    hidden: list[Callable[Parameters, Result]] = []
+
+    @functools.wraps(function)
+    def call(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
+        if "torch._dynamo" not in sys.modules:
+            return function(*args, **kwargs)
+        if not hidden:
+            hidden.append(torch.compiler.disable(function))
+        return hidden[0](*args, **kwargs)
+
+    return call
+
+
 def backend_for(tensor: torch.Tensor) -> Backend:
     """Back end that works on a tensor's device at its precision.
 
     Raises:
-        BackendError: The device has no Dr.Jit back end, or its back end cannot start on this machine.
+        BackendError: See :func:`get_backend`.
     """
     return get_backend(str(tensor.device), tensor.dtype)
 
 
-@cache
 def get_backend(device: str = "cpu", dtype: torch.dtype = torch.float32) -> Backend:
     """Back end for a device name (``"cpu"``, ``"cuda"``, ``"mps"``) and a precision.
 
     Raises:
-        BackendError: The device has no Dr.Jit back end, or its back end cannot start on this machine.
+        BackendError: The device has no Dr.Jit back end, its back end cannot start on this machine, or this process was
+            forked from one that had run kernels.
     """
-    torch_device = torch.device(device)
+    require_own_threads()
+    return _started_backend(device, dtype)
+
+
+@cache
+def _started_backend(device: str, dtype: torch.dtype) -> Backend:
+    try:
+        torch_device = torch.device(device)
+    except (RuntimeError, TypeError) as error:
+        raise BackendError(f"There is no device {described(device)}; use {devices_here()}.") from error
     name = _DEVICE_BACKENDS.get(torch_device.type)
     if name is None:
         raise BackendError(f"Device '{device}' has no Dr.Jit back end; move the tensors to 'cpu', 'cuda' or 'mps'.")
@@ -175,14 +215,45 @@ def default_device() -> torch.device:
     Raises:
         BackendError: None works.
     """
-    present = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available(), "cpu": True}
-    for device in (name for name, here in present.items() if here):
+    require_own_threads()
+    for device in _present_devices():
         try:
             get_backend(device)
             return torch.device(device)
         except BackendError:
             continue
     raise BackendError(_missing_backend("llvm"))
+
+
+def require_own_threads() -> None:
+    """Refuse to run in a process that is a copy of one in which kernels had run.
+
+    Raises:
+        BackendError: It is.
+    """
+    if _FORKED.is_set():
+        raise BackendError(
+            "This process was forked after its parent had rendered, and Dr.Jit's threads do not come along; start "
+            "workers by the method 'spawn': multiprocessing.get_context('spawn'), or "
+            "DataLoader(multiprocessing_context='spawn')."
+        )
+
+
+@cache
+def _watch_forks() -> None:
+    """Take note if this process, in which kernels run, is ever copied: a copy would wait for its threads for ever."""
+    if hasattr(os, "register_at_fork"):
+        os.register_at_fork(after_in_child=_FORKED.set)
+
+
+def _present_devices() -> list[str]:
+    present = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available(), "cpu": True}
+    return [name for name, is_here in present.items() if is_here]
+
+
+def devices_here() -> str:
+    """The devices that PyTorch can use on this machine and kernels might run on, for messages."""
+    return " or ".join(_present_devices())
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import torch
 from scipy.ndimage import gaussian_filter
 
 from difftetvr.errors import CaptureError
-from difftetvr.fitting.losses import l1, l2
+from difftetvr.fitting.losses import LOSSES, l1, l2
 from difftetvr.fitting.metrics import psnr, ssim
 
 
@@ -79,3 +79,10 @@ def test_losses():
     image, reference = torch.tensor([[[0.0, 1.0, 4.0]]]), torch.tensor([[[1.0, 1.0, 1.0]]])
     assert l1(image, reference).item() == pytest.approx(4 / 3)
     assert l2(image, reference).item() == pytest.approx(10 / 3)
+
+
+def test_the_ssim_of_a_loss_is_not_rounded_under_autocast():
+    image, reference = images()
+    expected = LOSSES["l1-ssim"](image, reference)
+    with torch.autocast("cpu"):
+        assert torch.allclose(LOSSES["l1-ssim"](image, reference), expected, rtol=1e-6)

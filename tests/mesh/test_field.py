@@ -38,7 +38,7 @@ def test_ambiguous_length_is_per_vertex_unless_said():
         (torch.rand(5, 3), torch.rand(4), r"density has shape \(4,\)"),
         (torch.rand(5, 3), torch.rand(5, 1), r"density has shape \(5, 1\)"),
         (torch.rand(5, 3).bool(), torch.rand(5), "torch.bool"),
-        ("red", torch.rand(5), "array of numbers"),
+        ("red", torch.rand(5), "real numbers"),
     ],
 )
 def test_wrong_shapes(color, density, message):

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from difftetvr.backend import get_backend
+from difftetvr.errors import DiffTetError
 from difftetvr.optics import ConstantPerCell, ExactLinear, SubSegments
 
 from .reference import crossings, quadrature
@@ -125,7 +126,7 @@ EDGES = np.array([[0, 1, 1], [1, 0, 0], [0, 0, 0], [1e10, 1, 0], [1e10, 0, 1], [
 
 def test_invalid_number_of_subsegments():
     for count in (0, 257):
-        with pytest.raises(ValueError, match="from 1 to 256"):
+        with pytest.raises(DiffTetError, match="from 1 to 256"):
             SubSegments(count)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 
 from difftetvr.errors import CaptureError
+from difftetvr.rendering.cameras.rigid import full_precision
 
 SSIM_WINDOW = 11
 _SSIM_SIGMA = 1.5
@@ -93,5 +94,6 @@ def _gaussian(like: torch.Tensor) -> torch.Tensor:
 
 def _blur(channels: torch.Tensor, window: torch.Tensor) -> torch.Tensor:
     stack = channels[:, None]
-    stack = torch.nn.functional.conv2d(stack, window.reshape(1, 1, -1, 1))
-    return torch.nn.functional.conv2d(stack, window.reshape(1, 1, 1, -1))[:, 0]
+    with full_precision(channels):
+        stack = torch.nn.functional.conv2d(stack, window.reshape(1, 1, -1, 1))
+        return torch.nn.functional.conv2d(stack, window.reshape(1, 1, 1, -1))[:, 0]

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import torch
 
 from difftetvr.errors import MeshError, counted
+from difftetvr.inputs import as_reals, described, moved, require_type
 from difftetvr.mesh.harmonics import COUNTS, harmonic_basis
-
-if TYPE_CHECKING:
-    from difftetvr.mesh.tetmesh import TetMesh
+from difftetvr.mesh.tetmesh import TetMesh
 
 Location = Literal["vertex", "cell"]
 
@@ -38,8 +37,8 @@ class Field:
     harmonics: torch.Tensor | None = None
 
     def __post_init__(self) -> None:
-        color = _as_floats(self.color, "color")
-        density = _as_floats(self.density, "density")
+        color = as_reals(self.color, "The field's color", MeshError)
+        density = as_reals(self.density, "The field's density", MeshError)
         if color.ndim != 2 or color.shape[1] != 3:
             raise MeshError(f"The field's color has shape {tuple(color.shape)}; pass linear RGB of shape (N, 3).")
         if density.shape != color.shape[:1]:
@@ -47,10 +46,9 @@ class Field:
                 f"The field's density has shape {tuple(density.shape)} and its color {tuple(color.shape)}; "
                 f"pass one density for each color, shape ({color.shape[0]},)."
             )
-        if self.location not in (None, "vertex", "cell"):
-            raise MeshError(f'The field\'s location is {self.location!r}; pass "vertex", "cell" or None.')
+        require_location(self.location, "The field's location")
         if self.harmonics is not None:
-            harmonics = _as_floats(self.harmonics, "harmonics")
+            harmonics = as_reals(self.harmonics, "The field's harmonics", MeshError)
             counts = {(len(color), count, 3) for count in COUNTS[1:]}
             if tuple(harmonics.shape) not in counts:
                 raise MeshError(
@@ -77,13 +75,7 @@ class Field:
         Raises:
             MeshError: The field's length is not that of the location.
         """
-        counts: dict[Location, int] = {"vertex": mesh.num_vertices, "cell": mesh.num_cells}
-        candidates: tuple[Location, ...] = ("vertex", "cell") if self.location is None else (self.location,)
-        for location in candidates:
-            if len(self) == counts[location]:
-                return location
-        wanted = " or ".join(f"{counts[location]} for one per {location}" for location in candidates)
-        raise MeshError(f"The field has {counted(len(self), 'value')}, but this mesh needs {wanted}.")
+        return location_of(len(self), self.location, mesh, f"The field has {counted(len(self), 'value')}")
 
     def arrays(self) -> dict[str, torch.Tensor]:
         """What files keep of it, by name: (N, 3) ``color``, (N,) ``density``, (N, 3 B) ``harmonics`` if it has any."""
@@ -124,9 +116,12 @@ class Field:
 
         Returns:
             A field that autograd sees as a function of this one.
+
+        Raises:
+            MeshError: This machine has no such device.
         """
-        color, density = (tensor.to(device=device, dtype=dtype) for tensor in (self.color, self.density))
-        harmonics = None if self.harmonics is None else self.harmonics.to(device=device, dtype=dtype)
+        color, density = (moved(tensor, device, dtype, MeshError) for tensor in (self.color, self.density))
+        harmonics = None if self.harmonics is None else moved(self.harmonics, device, dtype, MeshError)
         return Field(color, density, self.location, harmonics)
 
     def seen_from(self, mesh: TetMesh, eye: torch.Tensor) -> Field:
@@ -150,14 +145,36 @@ class Field:
         return Field(color.clamp(min=0.0), self.density, self.location)
 
 
-def _as_floats(values: Any, what: str) -> torch.Tensor:
-    try:
-        tensor = torch.as_tensor(values)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise MeshError(f"The field's {what} cannot be read as an array of numbers; pass a tensor.") from error
-    if tensor.is_complex() or tensor.dtype == torch.bool:
-        raise MeshError(f"The field's {what} is {tensor.dtype}; pass float32 or float64.")
-    return tensor if tensor.dtype in (torch.float32, torch.float64) else tensor.to(torch.float32)
+def require_location(location: Any, name: str) -> None:
+    """Refuse what is no `Location` and not None.
+
+    Raises:
+        MeshError: Says what it is, and that it was passed as ``name``.
+    """
+    if not (location is None or (isinstance(location, str) and location in ("vertex", "cell"))):
+        raise MeshError(f'{name} is {described(location)}; pass "vertex", "cell" or None.')
+
+
+def location_of(count: int, location: Location | None, mesh: TetMesh, subject: str) -> Location:
+    """Where on a mesh a number of values live.
+
+    Args:
+        count: Their number.
+        location: Where they are said to live; None lets the number decide, vertices first where both fit.
+        mesh: The mesh.
+        subject: Beginning of the message where they fit neither: "The field has 3 values".
+
+    Raises:
+        MeshError: Their number is not that of the location.
+    """
+    require_type(mesh, TetMesh, "The mesh", "pass a difftetvr.TetMesh", MeshError)
+    counts: dict[Location, int] = {"vertex": mesh.num_vertices, "cell": mesh.num_cells}
+    candidates: tuple[Location, ...] = ("vertex", "cell") if location is None else (location,)
+    for candidate in candidates:
+        if count == counts[candidate]:
+            return candidate
+    wanted = " or ".join(f"{counts[candidate]} for one per {candidate}" for candidate in candidates)
+    raise MeshError(f"{subject}, but this mesh needs {wanted}.")
 
 
 def _refuse_first(bad: torch.Tensor, values: torch.Tensor, what: str, advice: str) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 
 from difftetvr.errors import MeshError
+from difftetvr.inputs import described, moved
 from difftetvr.mesh import quality, validation
 from difftetvr.mesh.arrays import true_indices
 from difftetvr.mesh.frame import WORLD, Origin, origin_for, reoriented
@@ -219,15 +220,15 @@ class TetMesh:
             This mesh where nothing changes; else one whose vertices autograd sees as a function of these.
 
         Raises:
-            MeshError: dtype is no such dtype, or rounding to float32 flattened or inverted a cell. A mesh far from its
-                origin gets a nearer one first, see `with_origin`.
+            MeshError: dtype is no such dtype, this machine has no such device, or rounding to float32 flattened or
+                inverted a cell. A mesh far from its origin gets a nearer one first, see `with_origin`.
         """
-        if dtype not in (None, torch.float32, torch.float64):
-            raise MeshError(f"A mesh cannot have {dtype} vertices; use torch.float32 or torch.float64.")
+        if not any(dtype is known for known in (None, torch.float32, torch.float64)):
+            raise MeshError(f"A mesh cannot have {described(dtype)} vertices; use torch.float32 or torch.float64.")
         rounds = dtype == torch.float32 and self.vertices.dtype == torch.float64
         nearer = origin_for(self.vertices) if rounds else WORLD
         near = self.vertices if nearer == WORLD else reoriented(self.vertices, WORLD, nearer, torch.float64)
-        vertices = near.to(device=device, dtype=dtype)
+        vertices = moved(near, device, dtype, MeshError)
         if vertices is self.vertices:
             return self
         x, y, z = (a + b for a, b in zip(self.origin, nearer, strict=True))

@@ -8,7 +8,7 @@ from typing import Any
 import drjit as dr
 
 from difftetvr.optics.model import Adjoint, Weights
-from difftetvr.optics.special import constant_density
+from difftetvr.optics.special import constant_density, depth_of
 
 
 @dataclass(frozen=True)
@@ -21,11 +21,11 @@ class ConstantPerCell:
 
     def weights(self, length: Any, s0: Any, s1: Any) -> Weights:
         """See :meth:`OpticalModel.weights`."""
-        w0, w1, transmittance, _ = constant_density(length * s0)
+        w0, w1, transmittance, _ = constant_density(depth_of(length, s0))
         return w0, w1, transmittance
 
     def adjoint(self, length: Any, s0: Any, s1: Any, g0: Any, g1: Any, gt: Any) -> Adjoint:
         """See :meth:`OpticalModel.adjoint`."""
-        w0, w1, transmittance, moment = constant_density(length * s0)
+        w0, w1, transmittance, moment = constant_density(depth_of(length, s0))
         d_tau = dr.fma(g0 - g1, moment, dr.fma(g1, transmittance, -gt))
         return w0, w1, transmittance, s0 * d_tau, length * d_tau, type(d_tau)(0.0)

@@ -8,7 +8,14 @@ from typing import Any
 import drjit as dr
 
 from difftetvr.optics.model import Adjoint, Weights
-from difftetvr.optics.special import THIN, thick_derivatives, thick_weights, thin_derivatives, thin_weights
+from difftetvr.optics.special import (
+    THIN,
+    depth_of,
+    thick_derivatives,
+    thick_weights,
+    thin_derivatives,
+    thin_weights,
+)
 
 
 @dataclass(frozen=True)
@@ -22,12 +29,12 @@ class ExactLinear:
 
     def weights(self, length: Any, s0: Any, s1: Any) -> Weights:
         """See :meth:`OpticalModel.weights`."""
-        a, b = length * s0, length * s1
+        a, b = depth_of(length, s0), depth_of(length, s1)
         return dr.if_stmt((a, b), a + b > 2.0 * THIN, thick_weights, thin_weights)
 
     def adjoint(self, length: Any, s0: Any, s1: Any, g0: Any, g1: Any, gt: Any) -> Adjoint:
         """See :meth:`OpticalModel.adjoint`."""
-        a, b = length * s0, length * s1
+        a, b = depth_of(length, s0), depth_of(length, s1)
         w0, w1, transmittance, w0_a, w0_b = dr.if_stmt((a, b), a + b > 2.0 * THIN, thick_derivatives, thin_derivatives)
         difference = g0 - g1
         common = 0.5 * dr.fma(g1, transmittance, -gt)

@@ -49,6 +49,14 @@ class _Tables:
     visible: float
 
 
+def depth_of(length: Any, density: Any) -> Any:
+    """Optical depth of a crossing of constant density, or the greatest whose square does not overflow.
+
+    Nothing shows beyond: all light is absorbed where the ray enters, long before.
+    """
+    return dr.fmin(length * density, 1e150 if dr.type_v(length) == dr.VarType.Float64 else 1e18)
+
+
 def polynomial(coefficients: Sequence[float], x: Any) -> Any:
     """Polynomial by Horner's rule with fused multiply-adds, lowest coefficient first."""
     result = type(x)(coefficients[-1])

@@ -7,8 +7,10 @@ from typing import Any
 
 import drjit as dr
 
+from difftetvr.errors import DiffTetError
+from difftetvr.inputs import as_whole, described
 from difftetvr.optics.model import Adjoint, Weights
-from difftetvr.optics.special import constant_density
+from difftetvr.optics.special import constant_density, depth_of
 
 
 @dataclass(frozen=True)
@@ -20,13 +22,17 @@ class SubSegments:
 
     Attributes:
         count: Number of sub-segments, from 1 to 256.
+
+    Raises:
+        DiffTetError: The count is no such number.
     """
 
     count: int = 4
 
     def __post_init__(self) -> None:
-        if not 1 <= self.count <= 256:
-            raise ValueError(f"SubSegments needs a count from 1 to 256, not {self.count}.")
+        count = as_whole(self.count, "The count of SubSegments", DiffTetError)
+        if not 1 <= count <= 256:
+            raise DiffTetError(f"SubSegments needs a count from 1 to 256, not {described(count)}.")
 
     def weights(self, length: Any, s0: Any, s1: Any) -> Weights:
         """See :meth:`OpticalModel.weights`."""
@@ -62,7 +68,7 @@ class SubSegments:
         return w0, w1, transmittance, d_length, length * d_s0, length * d_s1
 
     def _depth(self, i: int, length: Any, s0: Any, s1: Any) -> Any:
-        return length * dr.lerp(s0, s1, (i + 0.5) / self.count) / self.count
+        return depth_of(length, dr.lerp(s0, s1, (i + 0.5) / self.count)) / self.count
 
     def _prefix_transmittances(self, length: Any, s0: Any, s1: Any) -> list[Any]:
         result = [type(length)(1.0)]

@@ -14,6 +14,7 @@ import torch
 
 from difftetvr.errors import CaptureError
 from difftetvr.files import atomic_write
+from difftetvr.inputs import as_reals, require_type
 from difftetvr.trust import require_regular
 
 Values = TypeVar("Values", np.ndarray, torch.Tensor)
@@ -27,7 +28,8 @@ _HINT = "give a transfer function as .json or .xml"
 class TransferFunction:
     """Colour and opacity as piecewise-linear functions of a scalar, constant outside the first and last knot.
 
-    Two knots at the same scalar make a jump; at the jump itself the later knot counts.
+    Two knots at the same scalar make a jump; at the jump itself the later knot counts. Derivatives of images by their
+    places are one-sided: the earlier one can only move down, the later one only up.
 
     Attributes:
         scalar: (K,) knot positions in [0, 1], not decreasing, K >= 1. Lists and arrays are accepted and converted.
@@ -46,9 +48,8 @@ class TransferFunction:
 
     def __post_init__(self) -> None:
         for key in ("scalar", "opacity", "color"):
-            value = getattr(self, key)
-            tensor = value if isinstance(value, torch.Tensor) else torch.tensor(np.asarray(value, dtype=np.float32))
-            object.__setattr__(self, key, tensor if tensor.is_floating_point() else tensor.to(torch.float32))
+            name = f"The {key} of the transfer function '{self.name}'"
+            object.__setattr__(self, key, as_reals(getattr(self, key), name, CaptureError, torch.float32))
         count = self.scalar.numel()
         if count < 1 or self.scalar.dim() != 1:
             raise CaptureError(f"The transfer function '{self.name}' has no control points; give at least one.")
@@ -79,10 +80,15 @@ class TransferFunction:
 
         Returns:
             Colour (..., 3) and opacity (...), of the same kind and precision as ``scalar``.
+
+        Raises:
+            CaptureError: These are no real numbers.
         """
+        require_type(scalar, (np.ndarray, torch.Tensor), "The scalar", "pass an array or a tensor", CaptureError)
         if isinstance(scalar, np.ndarray):
-            color, opacity = self(torch.from_numpy(np.ascontiguousarray(scalar)))
+            color, opacity = self(as_reals(np.ascontiguousarray(scalar), "The scalar", CaptureError))
             return color.numpy(), opacity.numpy()
+        scalar = as_reals(scalar, "The scalar", CaptureError)
         knots = self.scalar.to(scalar)
         last = knots.numel() - 1
         right = torch.searchsorted(knots.detach(), scalar.detach().contiguous(), right=True)
@@ -124,6 +130,7 @@ class TransferFunction:
         Raises:
             CaptureError: The file is missing, of another kind, or not valid.
         """
+        require_type(path, (str, Path), "The file of the transfer function", "pass its path", CaptureError)
         suffix = Path(path).suffix.lower()
         if suffix == ".json":
             return TransferFunction.from_json(path)

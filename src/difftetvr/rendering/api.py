@@ -9,8 +9,9 @@ from typing import Any
 
 import torch
 
-from difftetvr.backend import backend_for
+from difftetvr.backend import backend_for, eager, require_own_threads
 from difftetvr.errors import DiffTetError, MeshError
+from difftetvr.inputs import as_number, as_reals, described, require_type
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.optics import ConstantPerCell, ExactLinear, OpticalModel
 from difftetvr.rendering.autograd import TRACERS, Content, RenderFunction, RenderTask
@@ -32,7 +33,8 @@ class RenderedImage:
         color: (H, W, 3) premultiplied radiance, linear RGB, composited over the background.
         alpha: (H, W) opacity in [0, 1]: one minus the transmittance of the whole ray.
         depth: (H, W) expected distance from the camera at which light is absorbed, in world units; 0 where alpha is 0.
-        optical_depth: (H, W) integral of the density along the ray: what a tomograph measures.
+        optical_depth: (H, W) integral of the density along the ray: what a tomograph measures. That of the whole ray,
+            also behind the last light; with a transmittance threshold, only to where the ray stops.
     """
 
     color: torch.Tensor
@@ -41,6 +43,7 @@ class RenderedImage:
     optical_depth: torch.Tensor
 
 
+@eager
 def render(
     mesh: TetMesh,
     field: Field | ScalarField,
@@ -68,8 +71,8 @@ def render(
             the crossings of each pixel; ``"projected"`` sorts the cells once for the whole view, which also renders
             loose cells, but warns (`OrderWarning`) where no exact order is certain. All use the same optics.
         optics: Optical model of one cell; exact integration of the linear field if None.
-        transmittance_threshold: Rays stop once their transmittance is at or below this value, in [0, 1); 0 stops none
-            before it vanishes.
+        transmittance_threshold: Rays stop once their transmittance is at or below this value, in [0, 1), and with them
+            what they integrate; 0 stops none.
         deterministic: Whether gradients are the same in every run to the last bit: the backward pass then runs on one
             thread. CPU only. Images always are.
         clip_plane: (4,) a, b, c, d: only what lies in the half-space a x + b y + c z + d >= 0 of the world is seen.
@@ -79,11 +82,10 @@ def render(
 
     Raises:
         MeshError: The field does not fit the mesh, or holds a negative density or a value that is not finite.
-        DiffTetError: An argument is out of range.
-        BackendError: No back end runs on the device of the vertices.
+        DiffTetError: An argument is of the wrong kind or out of range.
+        BackendError: No back end runs on the device of the vertices, or this process was forked after its parent had
+            rendered.
     """
-    if renderer not in RENDERERS:
-        raise DiffTetError(f"There is no renderer '{renderer}'; choose one of {', '.join(RENDERERS)}.")
     view = prepare_view(mesh, field, camera, optics, transmittance_threshold, deterministic, renderer)
     behind = as_background(background, mesh.vertices)
     limits = view.limits(clip_plane)
@@ -125,8 +127,14 @@ def prepare_view(
     renderer: str = "marching",
 ) -> PreparedView:
     """Check a view's inputs and bring them into camera space; arguments and errors are those of :func:`render`."""
+    _require_kinds(mesh, field, camera, optics)
+    if not isinstance(renderer, str) or renderer not in RENDERERS:
+        raise DiffTetError(f"There is no renderer {described(renderer)}; choose one of {', '.join(RENDERERS)}.")
+    require_type(deterministic, bool, "deterministic", "pass True or False", DiffTetError)
+    transmittance_threshold = as_number(transmittance_threshold, "transmittance_threshold", DiffTetError)
     if not 0.0 <= transmittance_threshold < 1.0:
         raise DiffTetError(f"transmittance_threshold is {transmittance_threshold}; it must lie in [0, 1).")
+    require_own_threads()  # here already, since in a copy of a process torch may hang, too
     camera = camera.relative_to(mesh.origin)
     content, parts = _content(mesh, field, camera)
     for tensor in parts:
@@ -144,9 +152,9 @@ def prepare_view(
     task = RenderTask(backend, mesh, camera, optics, content, transmittance_threshold, deterministic, renderer)
     vertices, unit = _unit_of_length(positions, mesh)
     if unit != 1.0 and content == "scalar":
-        parts = *parts[:2], torch.cat((parts[2][:, :1] * unit, parts[2][:, 1:]), dim=1)
+        parts = *parts[:2], torch.cat((_by_unit(parts[2][:, :1], unit), parts[2][:, 1:]), dim=1)
     elif unit != 1.0:
-        parts = parts[0], parts[1] * unit
+        parts = parts[0], _by_unit(parts[1], unit)
     return PreparedView(task, vertices, parts, unit)
 
 
@@ -172,6 +180,16 @@ def _camera_space(mesh: TetMesh, camera: Camera) -> torch.Tensor:
     return rounded
 
 
+def _require_kinds(mesh: Any, field: Any, camera: Any, optics: Any) -> None:
+    """Refuse arguments of the wrong kind, those first that come in batches elsewhere."""
+    require_type(mesh, TetMesh, "mesh", "pass a difftetvr.TetMesh", DiffTetError)
+    require_type(field, (Field, ScalarField), "field", "pass one difftetvr.Field or ScalarField", DiffTetError)
+    require_type(camera, Camera, "camera", "pass one difftetvr.Camera, and render each view by itself", DiffTetError)
+    has_model = not isinstance(optics, type) and all(callable(getattr(optics, n, None)) for n in ("weights", "adjoint"))
+    if not (optics is None or has_model):
+        raise DiffTetError(f"optics is {described(optics)}; pass a model, such as difftetvr.optics.ExactLinear().")
+
+
 def _content(mesh: TetMesh, field: Field | ScalarField, camera: Camera) -> tuple[Content, tuple[torch.Tensor, ...]]:
     """What the volume holds, and its tensors as they are."""
     location = field.location_on(mesh)
@@ -193,12 +211,10 @@ def as_background(background: Any, like: torch.Tensor) -> torch.Tensor | None:
     """
     if background is None:
         return None
-    try:
-        behind = torch.as_tensor(background, dtype=like.dtype, device=like.device)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise DiffTetError(f"background is {background!r}; give three linear RGB components.") from error
+    advice = "give a tuple or tensor"
+    behind = as_reals(background, "background", DiffTetError, like.dtype, advice).to(like)
     if behind.shape != (3,) or not bool(torch.isfinite(behind.detach()).all()):
-        raise DiffTetError(f"background is {background!r}; give three finite linear RGB components.")
+        raise DiffTetError(f"background is {described(background)}; give three finite linear RGB components.")
     return behind
 
 
@@ -217,6 +233,11 @@ def _unit_of_length(vertices: torch.Tensor, mesh: TetMesh) -> tuple[torch.Tensor
         return vertices, 1.0
     unit = 2.0 ** math.frexp(largest)[1]
     return vertices / unit, unit
+
+
+def _by_unit(density: torch.Tensor, unit: float) -> torch.Tensor:
+    """Densities per unit of length; beyond what the precision holds they are as great as it allows, never infinite."""
+    return (density * unit).clamp(max=torch.finfo(density.dtype).max)
 
 
 def _times(values: torch.Tensor, unit: float) -> torch.Tensor:

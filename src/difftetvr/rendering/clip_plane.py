@@ -8,7 +8,10 @@ from typing import Any
 import torch
 
 from difftetvr.errors import DiffTetError
+from difftetvr.inputs import as_reals, described
 from difftetvr.rendering.cameras.pinhole import Camera
+
+_FINITE = "give four finite numbers a, b, c, d, the first three not all 0"
 
 
 def clip_limits(
@@ -31,23 +34,21 @@ def clip_limits(
     Raises:
         DiffTetError: These are not four finite numbers, or the normal (a, b, c) is zero.
     """
-    try:
-        coefficients = torch.as_tensor(plane, dtype=like.dtype, device=like.device)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise DiffTetError(f"clip_plane is {plane!r}; give the four numbers a, b, c, d.") from error
+    exact = as_reals(plane, "clip_plane", DiffTetError, torch.float64, "give a list or tensor a, b, c, d")
+    coefficients = exact.to(like)
     values = coefficients.detach()
     if values.shape != (4,) or not bool(torch.isfinite(values).all()) or not bool(values[:3].any()):
-        raise DiffTetError(f"clip_plane is {plane!r}; give four finite numbers a, b, c, d, the first three not all 0.")
+        raise DiffTetError(f"clip_plane is {described(plane)}; {_FINITE}.")
     pose = camera.world_to_camera.to(like)
-    normal = pose[:3, :3] @ coefficients[:3]
+    # No matrix products, which torch.autocast would round.
+    normal = (pose[:3, :3] * coefficients[:3]).sum(1)
     offset = coefficients[3]
     if any(origin):
-        shift = torch.tensor(list(origin), dtype=torch.float64)
-        exact = torch.as_tensor(plane, dtype=torch.float64).cpu()
-        offset = (exact[3] + exact[:3] @ shift).to(like)
-    at_camera = offset - normal @ pose[:3, 3]
+        exact, shift = exact.cpu(), torch.tensor(list(origin), dtype=torch.float64)
+        offset = (exact[3].double() + (exact[:3].double() * shift).sum()).to(like)
+    at_camera = offset - (normal * pose[:3, 3]).sum()
     directions = camera.ray_directions().to(like.dtype)  # before the device: not all of them know float64
-    slope = directions.to(like.device) @ normal
+    slope = (directions.to(like.device) * normal).sum(-1)
     # Along a ray the plane's function is slope * t + at_camera.
     crossing = -at_camera / torch.where(slope == 0, 1.0, slope)
     nowhere = torch.where(at_camera < 0, -1.0, torch.inf)

@@ -6,7 +6,9 @@ from dataclasses import dataclass, fields
 
 import torch
 
+from difftetvr.backend import eager
 from difftetvr.errors import DiffTetError, MeshError
+from difftetvr.inputs import as_reals, described, require_type
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.rendering.api import as_background, compose, prepare_view
 from difftetvr.rendering.cameras.pinhole import Camera
@@ -138,6 +140,7 @@ class ImageModel:
         )
 
 
+@eager
 @torch.no_grad()
 def model_image(
     mesh: TetMesh,
@@ -172,13 +175,19 @@ def model_image(
         DiffTetError: The truth has another size than the camera, or an argument is out of range.
         BackendError: No back end runs on the device of the mesh.
     """
-    if field.location_on(mesh) != "vertex":
+    require_type(field, Field, "field", "pass a difftetvr.Field", DiffTetError)
+    view = prepare_view(mesh, field, camera, None, transmittance_threshold, deterministic)
+    if view.task.content != "vertex":
         raise MeshError("The field lives on cells; hat functions need colours and densities on vertices.")
+    truth = as_reals(truth, "The true image", DiffTetError)
     if truth.shape != (camera.height, camera.width, 3):
         raise DiffTetError(
             f"The true image has shape {tuple(truth.shape)}; the camera takes ({camera.height}, {camera.width}, 3)."
         )
-    view = prepare_view(mesh, field, camera, None, transmittance_threshold, deterministic)
+    if valid is not None and not (
+        isinstance(valid, torch.Tensor) and valid.dtype == torch.bool and valid.shape == truth.shape[:2]
+    ):
+        raise DiffTetError(f"valid is {described(valid)}; pass a bool tensor of shape {tuple(truth.shape[:2])}.")
     behind = as_background(background, mesh.vertices)
     backend, size = view.task.backend, (camera.height, camera.width)
     with backend.exclusive(one_thread=deterministic):

@@ -9,7 +9,9 @@ from typing import Any
 import drjit as dr
 import torch
 
-from difftetvr.backend import backend_for
+from difftetvr.backend import eager, require_own_threads
+from difftetvr.errors import DiffTetError
+from difftetvr.inputs import require_type
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.rendering.api import prepare_view
 from difftetvr.rendering.cameras.pinhole import Camera
@@ -30,6 +32,7 @@ class RayStatistics:
     worst_quality: torch.Tensor
 
 
+@eager
 @torch.no_grad()
 def inspect_rays(
     mesh: TetMesh,
@@ -52,11 +55,13 @@ def inspect_rays(
         DiffTetError: There is no such renderer, or the plane is none.
         BackendError: No back end runs on the device of the mesh.
     """
+    require_type(mesh, TetMesh, "mesh", "pass a difftetvr.TetMesh", DiffTetError)
+    require_own_threads()
     quality = mesh.quality()
     # A field per cell makes the smallest vertex records; its first channel carries the quality.
     color = torch.stack((quality, torch.zeros_like(quality), torch.zeros_like(quality)), dim=1)
     view = prepare_view(mesh, Field(color, torch.zeros_like(quality), "cell"), camera, None, 0.0, False, renderer)
-    backend, size = backend_for(mesh.vertices), (camera.height, camera.width)
+    backend, size = view.task.backend, (camera.height, camera.width)
     limits = view.limits(clip_plane)
     with backend.exclusive():
         tracer = view.task.tracer(view.vertices, limits, view.parts)
@@ -71,7 +76,6 @@ def inspect_rays(
 class _Inspected:
     count: Any
     worst: Any
-    transmittance: Any
 
 
 class _InspectionKernel:
@@ -83,7 +87,7 @@ class _InspectionKernel:
 
     def start(self) -> _Inspected:
         real, lanes = self.view.backend.Float, dr.width(self.rays.pixel)
-        return _Inspected(dr.zeros(self.view.backend.Int, lanes), dr.full(real, dr.inf, lanes), dr.ones(real, lanes))
+        return _Inspected(dr.zeros(self.view.backend.Int, lanes), dr.full(real, dr.inf, lanes))
 
     def read(self, vertex: Any, active: Any) -> Corner:
         position, attributes = read_vertex(self.view, vertex, active)
@@ -98,7 +102,10 @@ class _InspectionKernel:
             if self.span.far is not None:
                 met &= step.entry[0] < self.span.far
         count = ray.count + dr.select(met, 1, 0)
-        return _Inspected(count, dr.select(met, dr.fmin(ray.worst, quality), ray.worst), ray.transmittance)
+        return _Inspected(count, dr.select(met, dr.fmin(ray.worst, quality), ray.worst))
+
+    def goes_on(self, ray: _Inspected) -> Any:
+        return dr.mask_t(ray.worst)(True)
 
     def leave(self, face: Face, ray: _Inspected, active: Any) -> _Inspected:
         return ray

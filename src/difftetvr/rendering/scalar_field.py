@@ -9,8 +9,9 @@ from dataclasses import dataclass
 import torch
 
 from difftetvr.errors import MeshError
+from difftetvr.inputs import as_number, as_reals, described, moved, require_type
 from difftetvr.mesh import Field, TetMesh
-from difftetvr.mesh.field import Location
+from difftetvr.mesh.field import Location, location_of, require_location
 from difftetvr.optics.transfer_function import TransferFunction
 
 
@@ -40,26 +41,33 @@ class ScalarField:
     location: Location | None = None
 
     def __post_init__(self) -> None:
-        scalar = self.scalar
-        if not isinstance(scalar, torch.Tensor) or not scalar.is_floating_point():
-            scalar = torch.as_tensor(scalar, dtype=torch.float64)
-            object.__setattr__(self, "scalar", scalar)
+        scalar = as_reals(self.scalar, "The scalar", MeshError, torch.float64)
+        object.__setattr__(self, "scalar", scalar)
         if scalar.dim() != 1 or scalar.shape[0] == 0:
             raise MeshError(f"The scalars have shape {tuple(scalar.shape)}; pass one number for each vertex or cell.")
         if not bool(torch.isfinite(scalar.detach()).all()):
             where = int(torch.nonzero(~torch.isfinite(scalar.detach()))[0])
             raise MeshError(f"Scalar {where} is not finite; correct it or leave its cells out.")
-        if not (math.isfinite(self.attenuation) and self.attenuation >= 0):
-            raise MeshError(f"The attenuation is {self.attenuation}; it must be finite and not negative.")
+        require_type(
+            self.transfer_function,
+            TransferFunction,
+            "The transfer function",
+            "pass a difftetvr.TransferFunction",
+            MeshError,
+        )
+        attenuation = as_number(self.attenuation, "The attenuation", MeshError)
+        if not (math.isfinite(attenuation) and attenuation >= 0):
+            raise MeshError(f"The attenuation is {attenuation}; it must be finite and not negative.")
         if self.value_range is not None:
-            try:
-                low, high = (float(value) for value in self.value_range)
-            except (TypeError, ValueError):
-                low, high = math.nan, math.nan
-            if not (math.isfinite(low) and math.isfinite(high) and low < high):
-                raise MeshError(f"The range of the scalars is {self.value_range}; give two numbers, the smaller first.")
-        if self.location not in (None, "vertex", "cell"):
-            raise MeshError(f'The location of the scalars is {self.location!r}; pass "vertex", "cell" or None.')
+            ends = as_reals(
+                self.value_range, "The range of the scalars", MeshError, torch.float64, "give two numbers, a tuple"
+            )
+            if ends.shape != (2,) or not -math.inf < float(ends[0]) < float(ends[1]) < math.inf:
+                raise MeshError(
+                    f"The range of the scalars is {described(self.value_range)}; give two numbers, the smaller first."
+                )
+            object.__setattr__(self, "value_range", tuple(ends.tolist()))
+        require_location(self.location, "The location of the scalars")
 
     def location_on(self, mesh: TetMesh) -> Location:
         """Where on a mesh the scalars live.
@@ -67,13 +75,8 @@ class ScalarField:
         Raises:
             MeshError: Their number is not that of the location.
         """
-        counts: dict[Location, int] = {"vertex": mesh.num_vertices, "cell": mesh.num_cells}
-        candidates: tuple[Location, ...] = ("vertex", "cell") if self.location is None else (self.location,)
-        for location in candidates:
-            if self.scalar.shape[0] == counts[location]:
-                return location
-        wanted = " or ".join(f"{counts[location]} for one per {location}" for location in candidates)
-        raise MeshError(f"There are {self.scalar.shape[0]} scalars, but this mesh needs {wanted}.")
+        count = self.scalar.shape[0]
+        return location_of(count, self.location, mesh, f"There are {count} scalars")
 
     def arrays(self) -> dict[str, torch.Tensor]:
         """What files keep of it, by name: (N,) ``scalar``. The transfer function has files of its own."""
@@ -94,8 +97,12 @@ class ScalarField:
         return Field(color, self.attenuation * opacity, self.location)
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> ScalarField:
-        """The same scalars on another device or in another precision; autograd sees them as a function of these."""
-        return dataclasses.replace(self, scalar=self.scalar.to(device=device, dtype=dtype))
+        """The same scalars on another device or in another precision; autograd sees them as a function of these.
+
+        Raises:
+            MeshError: This machine has no such device.
+        """
+        return dataclasses.replace(self, scalar=moved(self.scalar, device, dtype, MeshError))
 
     def knots(self, like: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """(K,) scalars and (K, 4) densities and linear RGB of the transfer function; differentiable.
@@ -104,5 +111,6 @@ class ScalarField:
             like: Tensor whose precision and device they get.
         """
         function = self.transfer_function
-        density = self.attenuation * function.opacity.to(like)
+        attenuation = min(self.attenuation, torch.finfo(like.dtype).max)
+        density = attenuation * function.opacity.to(like)
         return function.scalar.to(like), torch.cat((density[:, None], function.color.to(like)), dim=1)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import torch
 
-from difftetvr.backend import default_device, get_backend
+from difftetvr.backend import default_device, devices_here, get_backend
 from difftetvr.capture.capture import Capture
 from difftetvr.capture.degenerate import why_degenerate
 from difftetvr.errors import CaptureError, FitError
 from difftetvr.fitting.config import FitConfig
 from difftetvr.fitting.metrics import SSIM_WINDOW
 from difftetvr.fitting.refinement import Strategy
+from difftetvr.inputs import described
 
 _WITHOUT_DOUBLES = ("mps",)
 
@@ -71,8 +72,7 @@ def resolve_device(name: str | None) -> torch.device:
     try:
         device = torch.device(name)
         torch.empty(1, device=device)
-    except (RuntimeError, AssertionError, NotImplementedError) as error:
-        reason = str(error).splitlines()[0].rstrip(".")
-        raise FitError(f"The device '{name}' cannot be used ({reason}); use cpu, cuda or mps.") from error
+    except Exception as error:  # of any class, and up to kilobytes, for a device that this PyTorch was not built for
+        raise FitError(f"The device {described(name)} cannot be used on this machine; use {devices_here()}.") from error
     get_backend(name)
     return device

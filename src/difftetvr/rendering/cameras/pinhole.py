@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import operator
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -11,6 +10,8 @@ from typing import TYPE_CHECKING
 import torch
 
 from difftetvr.errors import CameraError
+from difftetvr.inputs import as_number, as_reals, as_whole, described
+from difftetvr.rendering.cameras.rigid import transformed
 
 if TYPE_CHECKING:
     from difftetvr.backend import Backend
@@ -39,7 +40,8 @@ class Camera:
         height: Image height in pixels.
 
     Raises:
-        CameraError: A value is out of range, or the extrinsics are no rigid transform.
+        CameraError: A value is out of range or no number, an intrinsic requires a gradient, or the extrinsics are no
+            rigid transform.
     """
 
     world_to_camera: torch.Tensor
@@ -51,9 +53,7 @@ class Camera:
     height: int
 
     def __post_init__(self) -> None:
-        pose = torch.as_tensor(self.world_to_camera)
-        if not pose.is_floating_point():
-            pose = pose.to(torch.float32)
+        pose = as_reals(self.world_to_camera, "world_to_camera", CameraError)
         object.__setattr__(self, "world_to_camera", pose)
         if pose.shape != (4, 4):
             raise CameraError(f"world_to_camera has shape {tuple(pose.shape)}; give a (4, 4) matrix.")
@@ -110,7 +110,11 @@ class Camera:
         fov_y, width, height = _number("fov_y", fov_y), _size("width", width), _size("height", height)
         if not 0.0 < fov_y < math.pi:
             raise CameraError(f"fov_y is {fov_y} radians; it must lie between 0 and pi.")
-        origin, center, upward = (torch.as_tensor(v, dtype=torch.float64).reshape(-1) for v in (eye, target, up))
+        vectors = {"eye": eye, "target": target, "up": up}
+        origin, center, upward = (
+            as_reals(v, name, CameraError, torch.float64, "pass a vector").double().reshape(-1)
+            for name, v in vectors.items()
+        )
         if any(v.numel() != 3 for v in (origin, center, upward)):
             raise CameraError("eye, target and up must each have three components.")
         if not all(bool(torch.isfinite(v).all()) for v in (origin, center, upward)):
@@ -133,7 +137,8 @@ class Camera:
     @property
     def position(self) -> torch.Tensor:
         """(3,) position of the camera in world space."""
-        return -self.world_to_camera[:3, :3].T @ self.world_to_camera[:3, 3]
+        pose = self.world_to_camera
+        return -(pose[:3, :3] * pose[:3, 3:]).sum(0)  # no matrix product, which torch.autocast would round
 
     @property
     def camera_to_world(self) -> torch.Tensor:
@@ -145,8 +150,10 @@ class Camera:
 
     def to_camera_space(self, points: torch.Tensor) -> torch.Tensor:
         """(N, 3) world-space points in camera space; differentiable in the points and the extrinsics."""
+        if not isinstance(points, torch.Tensor) or not points.is_floating_point() or points.shape[1:] != (3,):
+            raise CameraError(f"The points are {described(points)}; pass a tensor of shape (N, 3).")
         pose = self.world_to_camera.to(points)
-        return torch.addmm(pose[:3, 3], points, pose[:3, :3].T)
+        return transformed(points, pose[:3, :3], pose[:3, 3])
 
     def ray_directions(self) -> torch.Tensor:
         """(H, W, 3) unit directions of the pixels' rays in camera space, float64."""
@@ -164,6 +171,7 @@ class Camera:
 
     def with_size(self, width: int, height: int) -> Camera:
         """The same view at another resolution."""
+        width, height = _size("width", width), _size("height", height)
         sx, sy = width / self.width, height / self.height
         return replace(
             self, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy, width=width, height=height
@@ -188,17 +196,18 @@ class Camera:
 
 
 def _number(name: str, value: object) -> float:
-    try:
-        return float(value)  # type: ignore[arg-type]
-    except (TypeError, ValueError) as error:
-        raise CameraError(f"The camera's {name} is {value!r}; give a number.") from error
+    if isinstance(value, torch.Tensor) and value.requires_grad:
+        raise CameraError(
+            f"The camera's {name} requires a gradient, but images have none by intrinsics, only by the pose; pass "
+            f"float({name}.detach())."
+        )
+    return as_number(value, f"The camera's {name}", CameraError)
 
 
 def _size(name: str, value: object) -> int:
-    try:
-        pixels = operator.index(value)  # type: ignore[arg-type]
-    except TypeError as error:
-        raise CameraError(f"The camera's {name} is {value!r}; give a whole number of pixels.") from error
+    pixels = as_whole(value, f"The camera's {name}", CameraError, "give a whole number of pixels")
     if pixels < 1:
-        raise CameraError(f"The camera's {name} is {pixels} pixels; it must be at least 1.")
+        raise CameraError(f"The camera's {name} is {described(pixels)} pixels; it must be at least 1.")
+    if pixels > _MOST_PIXELS:
+        raise CameraError(f"The camera's {name} is {described(pixels)} pixels; take at most {_MOST_PIXELS:,} in all.")
     return pixels

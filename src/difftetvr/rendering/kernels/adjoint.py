@@ -192,7 +192,9 @@ class _AdjointKernel:
             constant = [record[3], self._radiance([record[0], record[1], record[2]])]
             start, end = [start[0], *constant], [end[0], *constant]
         ray, at_start, at_end = (
-            self._cross(start, end, ray) if self.view.transfer is None else self._cut(start, end, ray)
+            self._cross(start, end, ray, end[0] > start[0])
+            if self.view.transfer is None
+            else self._cut(start, end, ray)
         )
         if self.view.cells is not None:
             self._scatter_field(step.cell, at_start[1] + at_end[1], at_start[2] + at_end[2], True)
@@ -210,8 +212,13 @@ class _AdjointKernel:
         unused = [dr.zeros_like(ray.rest) for _ in range(3 - len(at_end))]
         return AdjointRay(ray.transmittance, ray.rest, at_end + unused, ray.limits)
 
-    def _cross(self, start: list[Any], end: list[Any], ray: AdjointRay) -> tuple[AdjointRay, list[Any], list[Any]]:
-        """Adjoint of one cell: derivatives with respect to (distance, density, radiance) at its start and end."""
+    def _cross(
+        self, start: list[Any], end: list[Any], ray: AdjointRay, is_crossed: Any
+    ) -> tuple[AdjointRay, list[Any], list[Any]]:
+        """Adjoint of one cell: derivatives with respect to (distance, density, radiance) at its start and end.
+
+        Where ``is_crossed`` is false, rounding has left nothing of the cell, and distances do not matter.
+        """
         (t0, s0, q0), (t1, s1, q1) = start, end
         far = self.pixel.distance
         if far is not None:  # to the weights, distance is one more colour
@@ -219,33 +226,42 @@ class _AdjointKernel:
         length = dr.fmax(t1 - t0, 0.0)
         g0, g1 = q0 * ray.transmittance, q1 * ray.transmittance
         w0, w1, transmittance, d_length, d_s0, d_s1 = self.view.optics.adjoint(length, s0, s1, g0, g1, type(length)(0))
-        rest = ray.rest - dr.fma(w0, g0, w1 * g1)
+        transmittance *= ray.transmittance
+        # Where no light comes through, nothing is left but what rounding has left.
+        rest = dr.select(transmittance > 0, ray.rest - dr.fma(w0, g0, w1 * g1), 0.0)
         # All that is still ahead is seen through this cell: its optical depth L (s0 + s1) / 2 dims the rest.
         half = 0.5 * (rest - self.pixel.optical_depth)
-        d_length = dr.select(t1 > t0, dr.fma(-half, s0 + s1, d_length), 0.0)
+        d_length = dr.select(is_crossed, dr.fma(-half, s0, dr.fma(-half, s1, d_length)), 0.0)
         d_s0, d_s1 = dr.fma(-half, length, d_s0), dr.fma(-half, length, d_s1)
         w0, w1 = w0 * ray.transmittance, w1 * ray.transmittance
         d_t0, d_t1 = -d_length, d_length
         if far is not None:
             d_t0, d_t1 = dr.fma(far, w0, d_t0), dr.fma(far, w1, d_t1)
         at_start, at_end = [d_t0, d_s0, w0], [d_t1, d_s1, w1]
-        return AdjointRay(ray.transmittance * transmittance, rest, ray.carry, ray.limits), at_start, at_end
+        return AdjointRay(transmittance, rest, ray.carry, ray.limits), at_start, at_end
 
     def _cut(self, start: list[Any], end: list[Any], ray: AdjointRay) -> tuple[AdjointRay, list[Any], list[Any]]:
         """Adjoint of one cell, piece by piece: derivatives with respect to (distance, scalar) at its start and end."""
         transfer, gradients = self.view.transfer, self.gradients.transfer
         assert transfer is not None and gradients is not None
 
+        # A jump's piece has no length, but moves with the jump.
+        is_crossed = end[0] > start[0]
+
         def visit(piece: Piece, state: tuple[AdjointRay, CrossingAdjoint]) -> tuple[AdjointRay, CrossingAdjoint]:
             ray, total = state
             ends = [[v[0], v[1], self._radiance(v[2:])] for v in (piece.start_values, piece.end_values)]
-            ray, at_start, at_end = self._cross(ends[0], ends[1], ray)
-            adjoint = PieceAdjoint(piece, start, end, gradients, self.gradients.mode)
+            ray, at_start, at_end = self._cross(ends[0], ends[1], ray, is_crossed)
+            adjoint = PieceAdjoint(transfer, piece, start, end, gradients, self.gradients.mode)
             return ray, adjoint.add(at_start, at_end, self.pixel.color, total)
 
         zeros = lambda: [dr.zeros_like(ray.rest) for _ in range(2)]  # noqa: E731
         ray, total = transfer.cut(start, end, visit, (ray, CrossingAdjoint(zeros(), zeros())))
         return ray, total.entry, total.leaving
+
+    def goes_on(self, ray: AdjointRay) -> Any:
+        integrates = (self.view.threshold == 0) & (self.pixel.optical_depth != 0)
+        return (ray.transmittance > self.view.threshold) | integrates
 
     def leave(self, face: Face, ray: AdjointRay, active: Any) -> AdjointRay:
         carry = ray.carry[: 1 + self.field_slots]

@@ -81,8 +81,13 @@ class _ForwardKernel:
         w0, w1 = w0 * ray.transmittance, w1 * ray.transmittance
         color = [dr.fma(w0, c0, dr.fma(w1, c1, c)) for c0, c1, c in zip(entry[2:], leaving[2:], ray.color, strict=True)]
         distance = dr.fma(w0, entry[0], dr.fma(w1, leaving[0], ray.distance))
-        optical_depth = dr.fma(0.5 * length, entry[1] + leaving[1], ray.optical_depth)
+        half = 0.5 * length
+        optical_depth = dr.fma(half, entry[1], dr.fma(half, leaving[1], ray.optical_depth))
         return Radiance(color, distance, optical_depth, ray.transmittance * transmittance)
+
+    def goes_on(self, ray: Radiance) -> Any:
+        # With a threshold of 0 the line integral is complete, however little light is left to see it by.
+        return (ray.transmittance > self.view.threshold) | (self.view.threshold == 0)
 
     def leave(self, face: Face, ray: Radiance, active: Any) -> Radiance:
         return ray

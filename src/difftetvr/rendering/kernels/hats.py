@@ -172,6 +172,9 @@ class _HatKernel:
         edges, edge_ids = self._finish_edges(step, ray, samples)
         return HatRay(transmittance, rest, edges, edge_ids, self._finish_faces(step, ray, samples))
 
+    def goes_on(self, ray: HatRay) -> Any:
+        return ray.transmittance > self.view.threshold
+
     def leave(self, face: Face, ray: HatRay, active: Any) -> HatRay:
         for corner in face.corners:
             self._scatter(self.records.vertices, corner.vertex, corner.adjoints, active)

@@ -82,11 +82,11 @@ class LinkedList:
                 corners = scene.indices_and_apex(half_face)
                 return index + 1, cross_cell(kernel, half_face >> 2, corners, ray, True)
 
-            see = lambda index, ray: (index < count) & (ray.transmittance > view.threshold)  # noqa: E731
+            see = lambda index, ray: (index < count) & kernel.goes_on(ray)  # noqa: E731
             _, ray = dr.while_loop((dr.zeros(uint, lanes), ray), see, cross)
             last = dr.select(count > 0, count - 1, 0)
             depth, face = heap.depths.read(last, count > 0), heap.faces.read(last, count > 0)
-            return (count == self.local_size) & (ray.transmittance > view.threshold), depth, face, ray
+            return (count == self.local_size) & kernel.goes_on(ray), depth, face, ray
 
         state = (
             rays.valid & (heads != NONE),

@@ -70,11 +70,11 @@ class Marching:
             ray = kernel.visit(step, ray)
             link = table_row(cell, step.exit.vertex(face), face, step.apex)
             behind = dr.gather(self.view.backend.UInt2, self.table, link, active)
-            active = active & (behind[0] != BOUNDARY) & (ray.transmittance > self.view.threshold)
+            active = active & (behind[0] != BOUNDARY) & kernel.goes_on(ray)
             return active, behind[0], behind[1], step.next_face, step.leaving, ray
 
         ray = kernel.start()
         if self.entries.is_simple:
             return enter(uint(0), ray)[1]
-        more = lambda index, ray: (index < count) & rays.valid & (ray.transmittance > self.view.threshold)  # noqa: E731
+        more = lambda index, ray: (index < count) & rays.valid & kernel.goes_on(ray)  # noqa: E731
         return dr.while_loop((dr.zeros(uint, dr.width(rays.pixel)), ray), more, enter)[1]

@@ -74,8 +74,7 @@ class Projected:
         kernel.finish(ray)
 
     def _composite(self, kernel: Kernel, rays: Rays, lists: TileLists, ray: Any) -> Any:
-        view, uint = self.view, self.view.backend.UInt
-        width = self.scene.rays.width
+        uint, width = self.view.backend.UInt, self.scene.rays.width
         row = rays.pixel // width
         tile = (row >> TILE_BITS) * self.tiler.columns + ((rays.pixel - row * width) >> TILE_BITS)
         end = dr.gather(uint, lists.end, tile, rays.valid)
@@ -92,7 +91,7 @@ class Projected:
 
         # A ray without a tile's list has an empty one: gathers give 0 where they are masked.
         state = (dr.gather(uint, lists.begin, tile, rays.valid), ray)
-        more = lambda index, ray: (index < end) & (ray.transmittance > view.threshold)  # noqa: E731
+        more = lambda index, ray: (index < end) & kernel.goes_on(ray)  # noqa: E731
         return dr.while_loop(state, more, cross)[1]
 
     def _entry(self, rays: Rays, cell: Any) -> tuple[Any, Any]:

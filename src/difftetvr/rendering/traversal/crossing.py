@@ -33,7 +33,7 @@ class View:
             x, y, z, density, linear RGB and 0, so that one cache line holds all of a vertex.
         cells: (T, 4) linear RGB and density for per-cell fields, else None.
         transfer: Transfer function of the vertices' scalars, None where vertices have densities and colours.
-        threshold: Transmittance below which a ray stops, as a device value.
+        threshold: Transmittance at or below which light counts as gone, as a device value.
         limits: (H, W, 2) distances between which each ray is looked at, None for all in front of the camera.
     """
 
@@ -101,7 +101,7 @@ class Step:
 
 
 class Kernel(Protocol):
-    """What is done at crossings. A ray's state is a PyTree with a ``transmittance``."""
+    """What is done at crossings. A ray's state is a PyTree."""
 
     def start(self) -> Any:
         """State of the rays before their first crossing."""
@@ -111,6 +111,9 @@ class Kernel(Protocol):
 
     def visit(self, step: Step, ray: Any) -> Any:
         """Cross a cell; the corners that stay are those of the next step's entry face. Returns the new state."""
+
+    def goes_on(self, ray: Any) -> Any:
+        """Whether a ray has something to gather from the cells that are still ahead of it."""
 
     def leave(self, face: Face, ray: Any, active: Any) -> Any:
         """Finish what the corners carry at a face with no next step behind it. Returns the new state."""

@@ -2,7 +2,9 @@
 
 Inside a cell the scalar is linear along a ray. Where it passes a knot of the transfer function the crossing is cut: on
 every piece density and colour are linear again, and the optical model integrates them as it does those of a mesh's
-field. Two knots at one scalar are a jump; the piece between them has no length.
+field. Two knots at one scalar are a jump; the piece between them has no length, but derivatives: the earlier knot can
+only move down and the later one up, and then the jump becomes a slope. At the jump itself the later knot counts, so
+scalars that lie on it can only move up.
 """
 
 from __future__ import annotations
@@ -72,6 +74,9 @@ class Transfer:
     def cut(self, entry: list[Any], leaving: list[Any], visit: Callable[[Piece, Any], Any], state: Any) -> Any:
         """Visit the pieces of a crossing in their order.
 
+        Knots at one of its ends cut it, too, unless its scalar is constant: pieces without a length matter to the
+        derivatives by these knots.
+
         Args:
             entry: Distance and scalar where it begins.
             leaving: Distance and scalar where it ends.
@@ -82,32 +87,41 @@ class Transfer:
             The final state.
         """
         (_, f0), (_, f1) = entry, leaving
-        rises = f1 >= f0
-        inverse = 1.0 / dr.select(f1 != f0, f1 - f0, 1.0)
+        rises, varies = f1 >= f0, f1 != f0
+        rise = dr.select(varies, f1 - f0, 1.0)
 
         def advance(_: Any, begin: PieceEnd, interval: Any, state: Any) -> tuple[Any, ...]:
             ahead = dr.select(rises, interval + 1, interval)
             is_knot = (ahead >= 0) & (ahead < self.count)
             knot = self.knot(ahead, is_knot)
-            cuts = is_knot & dr.select(rises, knot < f1, knot > f1)
-            x = dr.select(cuts, dr.fmax(dr.fmin((knot - f0) * inverse, 1.0), begin.x), 1.0)
-            end = PieceEnd(x, dr.select(cuts, knot, f1), cuts)
+            cuts = is_knot & varies & dr.select(rises, knot <= f1, knot >= f1)
+            x = dr.select(cuts & (knot != f1), dr.fmax(dr.fmin((knot - f0) / rise, 1.0), begin.x), 1.0)
+            end = PieceEnd(x, dr.select(cuts, knot, f1), cuts, ahead)
             state = visit(Piece.of(self, entry, leaving, interval, begin, end), state)
             return cuts, end, interval + dr.select(rises, 1, -1), state
 
         zero = dr.zeros_like(f0)
-        first = PieceEnd(zero, f0, dr.zeros(dr.mask_t(f0), dr.width(f0)))
-        start = (dr.full(dr.mask_t(f0), True, dr.width(f0)), first, self.interval(f0, rises), state)
+        interval = self.interval(f0, ~(rises & varies))
+        first = PieceEnd(zero, f0, dr.zeros(dr.mask_t(f0), dr.width(f0)), interval)
+        start = (dr.full(dr.mask_t(f0), True, dr.width(f0)), first, interval, state)
         return dr.while_loop(start, lambda more, *_: more, advance)[3]
 
 
 @dataclass
 class PieceEnd:
-    """An end of a piece: its place x in [0, 1] along the crossing, its scalar, and whether a knot decides it."""
+    """An end of a piece.
+
+    Attributes:
+        x: Its place in [0, 1] along the crossing.
+        scalar: Its scalar.
+        at_knot: Whether a knot decides both.
+        knot: Index of that knot.
+    """
 
     x: Any
     scalar: Any
     at_knot: Any
+    knot: Any
 
 
 @dataclass
@@ -138,21 +152,28 @@ class Piece:
         transfer: Transfer, entry: list[Any], leaving: list[Any], interval: Any, begin: PieceEnd, end: PieceEnd
     ) -> Piece:
         """The piece of a crossing in an interval of the knots."""
-        real, uint, float4 = transfer.backend.Float, transfer.backend.UInt, transfer.backend.Float4
+        uint, float4 = transfer.backend.UInt, transfer.backend.Float4
         lower = uint(dr.select(interval < 0, 0, interval))
         upper = uint(dr.select(interval + 1 < transfer.count, interval + 1, transfer.count - 1))
         below, above = (dr.gather(float4, transfer.values, index) for index in (lower, upper))
         low = transfer.knot(lower)
         width = transfer.knot(upper) - low
-        inverse_width = dr.select(width > 0, 1.0 / width, real(0))
+        inverse_width = _inverse(width)
         change = [above[k] - below[k] for k in range(4)]
         weights, ends = [], []
         for place in (begin, end):
             weight = dr.fmin(dr.fmax((place.scalar - low) * inverse_width, 0.0), 1.0)
+            # At a jump the scalar does not tell on which side of it an end is.
+            is_upper = place.at_knot & (place.knot > interval)
+            weight = dr.select(inverse_width > 0, weight, dr.select(is_upper, 1.0, 0.0))
             distance = dr.fma(place.x, leaving[0] - entry[0], entry[0])
             weights.append(weight)
-            ends.append([distance, *(dr.fma(weight, change[k], below[k]) for k in range(4))])
-        ends[1][0] = dr.select(end.at_knot, ends[1][0], leaving[0])
+            ends.append(
+                [
+                    dr.select(place.x < 1.0, distance, leaving[0]),
+                    *(dr.fma(weight, change[k], below[k]) for k in range(4)),
+                ]
+            )
         return Piece(lower, upper, change, inverse_width, begin, end, (weights[0], weights[1]), ends[0], ends[1])
 
 
@@ -176,12 +197,18 @@ class PieceAdjoint:
     """Hands the derivatives at a piece's ends on to knots, and to the ends of its crossing."""
 
     def __init__(
-        self, piece: Piece, entry: list[Any], leaving: list[Any], gradients: TransferGradients, mode: dr.ReduceMode
+        self,
+        transfer: Transfer,
+        piece: Piece,
+        entry: list[Any],
+        leaving: list[Any],
+        gradients: TransferGradients,
+        mode: dr.ReduceMode,
     ) -> None:
-        self.piece, self.gradients, self.mode = piece, gradients, mode
+        self.transfer, self.piece, self.gradients, self.mode = transfer, piece, gradients, mode
         (t0, f0), (t1, f1) = entry, leaving
-        self.length = t1 - t0
-        self.inverse_rise = dr.select(f1 != f0, 1.0 / (f1 - f0), 0.0)
+        self.speed = (t1 - t0) * _inverse(f1 - f0)
+        self.lowest, self.highest = dr.fmin(f0, f1), dr.fmax(f0, f1)
 
     def add(self, at_start: list[Any], at_end: list[Any], pixel: list[Any], total: CrossingAdjoint) -> CrossingAdjoint:
         """Add a piece's part.
@@ -206,18 +233,23 @@ class PieceAdjoint:
             high = [dr.fma(weight, g, s) for g, s in zip(gradient[1:], high, strict=True)]
             # A knot's value does not depend on where the knot is, a value between knots does.
             slope = dr.fma(gradient[1], change[0], gradient[2] * change[1]) * piece.inverse_width
-            slope = dr.select(place.at_knot, 0.0, slope)
-            knot_low = dr.fma(weight - 1.0, slope, knot_low)
-            knot_high = dr.fma(-weight, slope, knot_high)
+            slope_by_knots = dr.select(place.at_knot, 0.0, slope)
+            knot_low = dr.fma(weight - 1.0, slope_by_knots, knot_low)
+            knot_high = dr.fma(-weight, slope_by_knots, knot_high)
             # Where a knot cuts the crossing, on the other hand, it decides the distance.
-            moved = dr.select(place.at_knot, gradient[0] * self.length * self.inverse_rise, 0.0)
+            moved = gradient[0] * self.speed
+            moved_by_knot = dr.select(place.at_knot & ~self._is_held(place), moved, 0.0)
             at_upper = weight > 0.5
-            knot_high += dr.select(at_upper, moved, 0.0)
-            knot_low += dr.select(at_upper, 0.0, moved)
+            knot_high += dr.select(at_upper, moved_by_knot, 0.0)
+            knot_low += dr.select(at_upper, 0.0, moved_by_knot)
             entry[0] = dr.fma(1.0 - place.x, gradient[0], entry[0])
             leaving[0] = dr.fma(place.x, gradient[0], leaving[0])
+            # A scalar that is at the knot moves up, where the knot is none of the crossing's.
+            is_passed = place.at_knot & (place.scalar > self.lowest)
+            moved = dr.select(is_passed, moved, 0.0)
             entry[1] = dr.fma(place.x - 1.0, moved, entry[1])
             leaving[1] = dr.fma(-place.x, moved, leaving[1])
+            slope = dr.select(is_passed, 0.0, slope)
             if is_end:
                 leaving[1] += slope
             else:
@@ -226,8 +258,27 @@ class PieceAdjoint:
         self._scatter(piece.upper, high, knot_high, pixel)
         return CrossingAdjoint(entry, leaving)
 
+    def _is_held(self, place: PieceEnd) -> Any:
+        """Whether a knot, where it can move to, is none of the crossing's: that of a jump at the crossing's very end.
+
+        The first knot of a jump can only move down, where the crossing is not if the jump is at its least scalar; the
+        last one only up.
+        """
+        at_least, at_greatest = place.scalar == self.lowest, place.scalar == self.highest
+        reads, transfer = place.at_knot & (at_least | at_greatest), self.transfer
+        before, after = reads & (place.knot > 0), reads & (place.knot + 1 < transfer.count)
+        follows = before & (transfer.knot(place.knot - 1, before) == place.scalar)
+        precedes = after & (transfer.knot(place.knot + 1, after) == place.scalar)
+        return (at_least & precedes & ~follows) | (at_greatest & follows & ~precedes)
+
     def _scatter(self, knot: Any, values: list[Any], position: Any, pixel: list[Any]) -> None:
         record = [values[0], *(values[1] * g for g in pixel)]
         dr.scatter_add(self.gradients.knots, position, knot, mode=self.mode)
         for k, value in enumerate(record):
             dr.scatter_add(self.gradients.values, value, 4 * knot + k, mode=self.mode)
+
+
+def _inverse(difference: Any) -> Any:
+    """One over a difference; 0 where it is none, or so small that its inverse overflows."""
+    least = 4.0 * dr.smallest(difference)
+    return dr.select(dr.abs(difference) > least, 1.0 / difference, 0.0)

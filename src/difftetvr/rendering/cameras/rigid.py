@@ -1,0 +1,49 @@
+"""Points under a rigid transform, at their own precision whatever surrounds it."""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any
+
+import torch
+
+
+def transformed(points: torch.Tensor, rotation: torch.Tensor, offset: torch.Tensor) -> torch.Tensor:
+    """``points @ rotation.T + offset``, also where :class:`torch.autocast` would round the factors to 16 bits.
+
+    Args:
+        points: (N, 3).
+        rotation: (3, 3).
+        offset: (3,).
+
+    Returns:
+        (N, 3); differentiable in all three.
+    """
+    result: torch.Tensor = _Transform.apply(points, rotation, offset)
+    return result
+
+
+class _Transform(torch.autograd.Function):
+    """Its backward pass may run under ``autocast``, too, so it is not left to that of ``addmm``."""
+
+    @staticmethod
+    def forward(ctx: Any, points: torch.Tensor, rotation: torch.Tensor, offset: torch.Tensor) -> torch.Tensor:
+        ctx.save_for_backward(points, rotation)
+        with full_precision(points):
+            return torch.addmm(offset, points, rotation.T)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: torch.Tensor) -> Any:
+        points, rotation = ctx.saved_tensors
+        with full_precision(points):
+            return (
+                gradient @ rotation if ctx.needs_input_grad[0] else None,
+                gradient.T @ points if ctx.needs_input_grad[1] else None,
+                gradient.sum(0) if ctx.needs_input_grad[2] else None,
+            )
+
+
+def full_precision(like: torch.Tensor) -> AbstractContextManager[Any]:
+    """Where ``autocast`` is off for the device of a tensor."""
+    kind = like.device.type
+    return torch.autocast(kind, enabled=False) if torch.amp.is_autocast_available(kind) else nullcontext()

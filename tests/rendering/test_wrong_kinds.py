@@ -1,0 +1,160 @@
+"""Arguments of the wrong kind, batches among them: one readable sentence that names the argument, never a traceback."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from rendering.test_errors import assert_sentence
+
+from difftetvr.errors import CameraError, DiffTetError
+from difftetvr.inputs import described
+from difftetvr.mesh import Field, TetMesh
+from difftetvr.optics import ExactLinear, SubSegments, TransferFunction
+from difftetvr.rendering import Camera, ScalarField, render
+from difftetvr.rendering.gauss_newton import model_image
+from difftetvr.rendering.inspection import inspect_rays
+
+MESH = TetMesh.grid((2, 2, 2))
+COUNT = MESH.num_vertices
+FIELD = Field(torch.rand(COUNT, 3), torch.rand(COUNT))
+CAMERA = Camera.look_at((2.0, -2.0, 2.0), (0.5, 0.5, 0.5), width=8, height=8)
+FUNCTION = TransferFunction.default()
+POINTS: dict[str, Any] = {"scalar": [0, 1], "opacity": [0, 1], "color": [[0, 0, 0], [1, 1, 1]]}
+RENDER: dict[str, Any] = {"mesh": MESH, "field": FIELD, "camera": CAMERA}
+POSE: dict[str, Any] = {"world_to_camera": torch.eye(4), "fx": 9.0, "fy": 9.0, "cx": 4.0, "cy": 4.0}
+JUNK: dict[str, Any] = {
+    "text": "abc" * 999,
+    "number": 10**6000,
+    "class": ExactLinear,
+    "list": [[1, 2], [3]],
+    "objects": np.array([None, "a"]),
+    "tensor": torch.rand(64, 64, 3),
+    "complex": torch.ones(3, dtype=torch.complex64),
+    "meta": torch.empty(3, device="meta"),
+    "sparse": torch.eye(4).to_sparse(),
+    "cameras": [CAMERA, CAMERA],
+    "fields": (FIELD, FIELD),
+}
+CALLS: dict[str, tuple[Callable[..., Any], dict[str, Any], tuple[str, ...]]] = {
+    "render": (
+        render,
+        RENDER,
+        ("mesh", "field", "camera", "background", "renderer", "optics", "transmittance_threshold", "clip_plane"),
+    ),
+    "inspect_rays": (inspect_rays, {"mesh": MESH, "camera": CAMERA}, ("mesh", "camera", "renderer", "clip_plane")),
+    "model_image": (
+        model_image,
+        {**RENDER, "truth": torch.zeros(8, 8, 3)},
+        ("mesh", "field", "camera", "truth", "background", "transmittance_threshold", "valid"),
+    ),
+    "Camera": (Camera, {**POSE, "width": 8, "height": 8}, (*POSE, "width", "height")),
+    "look_at": (Camera.look_at, {"eye": (1, 2, 3), "target": (0, 0, 0)}, ("eye", "target", "up", "fov_y", "width")),
+    "with_size": (CAMERA.with_size, {"width": 8, "height": 8}, ("width", "height")),
+    "with_pose": (CAMERA.with_pose, {}, ("world_to_camera",)),
+    "to_camera_space": (CAMERA.to_camera_space, {}, ("points",)),
+    "Field": (Field, {"color": FIELD.color, "density": FIELD.density}, ("color", "density", "location", "harmonics")),
+    "ScalarField": (
+        ScalarField,
+        {"scalar": FIELD.density, "transfer_function": FUNCTION},
+        ("scalar", "transfer_function", "attenuation", "value_range", "location"),
+    ),
+    "TransferFunction": (TransferFunction, POINTS, ("scalar", "opacity", "color")),
+    "TransferFunction()": (FUNCTION, {}, ("scalar",)),
+    "SubSegments": (SubSegments, {}, ("count",)),
+}
+ACCEPTED = {
+    # What is no junk in these places: scalars may be arrays or tensors of any shape.
+    ("TransferFunction()", "scalar"): ("tensor",),
+}
+
+
+@pytest.mark.parametrize(("call", "name"), [(call, name) for call, (_, _, names) in CALLS.items() for name in names])
+def test_junk_is_refused_in_one_sentence(call: str, name: str) -> None:
+    function, arguments, _ = CALLS[call]
+    for what, value in JUNK.items():
+        if what in ACCEPTED.get((call, name), ()):
+            continue
+        with pytest.raises(DiffTetError) as error:
+            function(**{**arguments, name: value})
+        assert_sentence(error.value)
+        assert "tensor([" not in str(error.value), what
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"camera": [CAMERA, CAMERA]}, "camera is .*Camera.*; pass one"),
+        ({"field": [FIELD, FIELD]}, "field is .*Field.*; pass one"),
+        ({"field": FIELD.color}, "field is a tensor"),
+        ({"field": None}, "field is None"),
+        ({"mesh": (MESH.vertices, MESH.tets)}, "mesh is "),
+        ({"optics": "exact"}, r"optics is 'exact'; .*ExactLinear\(\)"),
+        ({"optics": ExactLinear}, r"optics is the class ExactLinear"),
+        ({"deterministic": "no"}, "deterministic is 'no'; pass True or False"),
+        ({"renderer": 3}, "no renderer 3; choose one of marching"),
+        ({"transmittance_threshold": "1e-4"}, "transmittance_threshold is '1e-4'"),
+        ({"background": torch.rand(8, 8, 3)}, r"background is a tensor of shape \(8, 8, 3\)"),
+        ({"background": (math.nan, 0.0, 0.0)}, r"background is \(nan, 0.0, 0.0\)"),
+        ({"clip_plane": torch.rand(2, 4)}, r"clip_plane is a tensor of shape \(2, 4\)"),
+    ],
+)
+def test_the_argument_is_named(change: dict[str, Any], words: str) -> None:
+    with pytest.raises(DiffTetError, match=words):
+        render(**{**RENDER, **change})
+
+
+def test_batches_of_values_are_refused() -> None:
+    with pytest.raises(DiffTetError, match=r"color has shape \(5, 27, 3\); pass linear RGB of shape \(N, 3\)"):
+        Field(torch.rand(5, COUNT, 3), torch.rand(5, COUNT))
+    with pytest.raises(DiffTetError, match=r"scalars have shape \(5, 27\)"):
+        ScalarField(torch.rand(5, COUNT), FUNCTION)
+    with pytest.raises(DiffTetError, match=r"world_to_camera has shape \(5, 4, 4\)"):
+        CAMERA.with_pose(torch.eye(4).expand(5, 4, 4))
+
+
+def test_hats_need_a_field() -> None:
+    with pytest.raises(DiffTetError, match=r"field is a ScalarField; pass a difftetvr\.Field"):
+        model_image(MESH, ScalarField(FIELD.density, FUNCTION), CAMERA, torch.zeros(8, 8, 3))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", ["fx", "fy", "cx", "cy"])
+def test_intrinsics_that_require_a_gradient_are_refused(name: str) -> None:
+    """Taking their value would drop the gradient without a word."""
+    with pytest.raises(CameraError, match=rf"{name} requires a gradient.*; pass float\({name}.detach\(\)\)"):
+        Camera(**{**POSE, name: torch.tensor(9.0, requires_grad=True)}, width=8, height=8)
+
+
+def test_arrays_lists_and_scalars_of_numpy_are_taken() -> None:
+    camera = Camera(np.eye(4), np.float32(9), torch.tensor(9.0), np.float64(4), 4, np.int64(8), torch.tensor(8))
+    assert camera.width == 8 and camera.fx == 9.0 and camera.world_to_camera.dtype == torch.float64
+    field = Field(FIELD.color.numpy(), FIELD.density.tolist())
+    image = render(MESH, field, CAMERA, background=np.array([1, 0, 0]), clip_plane=np.array([0, 0, 1, 5]))
+    assert torch.equal(image.color, render(MESH, FIELD, CAMERA, background=(1, 0, 0)).color)
+    function = TransferFunction(**{key: np.array(value) for key, value in POINTS.items()})
+    assert all(t.dtype == torch.float32 for t in (function.scalar, function.opacity, function.color))
+    scalar = ScalarField(FIELD.density.half(), function, np.float32(2.0), value_range=np.array([0, 1]))
+    assert scalar.scalar.dtype == torch.float64 and scalar.value_range == (0.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        (torch.rand(3, 4), "a tensor of shape (3, 4)"),
+        (torch.nn.Parameter(torch.rand(3)), "a tensor of shape (3,)"),
+        (np.zeros((2, 2)), "an array of shape (2, 2)"),
+        ([torch.rand(2), None], "[a tensor of shape (2,), None]"),
+        ((1.5, True), "(1.5, True)"),
+        ([1, 2, 3, 4, 5, 6], "[1, 2, 3, 4, ...]"),
+        (CAMERA, "a Camera"),
+        (Camera, "the class Camera"),
+        ("two\nlines", r"'two\nlines'"),
+        (10**50, "a huge number"),
+    ],
+)
+def test_values_in_messages(value: Any, words: str) -> None:
+    assert described(value) == words
