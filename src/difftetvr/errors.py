@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import reprlib
+from typing import Any
+
+_MOST_SHOWN = 16
+
 
 class DiffTetError(Exception):
     """Base of all errors raised for bad input; the command line prints its sentence and exits with code 2."""
@@ -29,6 +34,25 @@ class FitError(DiffTetError):
 
 class BackendError(DiffTetError):
     """No Dr.Jit back end can run the kernels on this machine or on the device of the given tensors."""
+
+
+def shown(value: Any) -> str:
+    """A value as it stands in a sentence: tensors and arrays as their numbers, those of many by their shape.
+
+    Args:
+        value: Whatever was given.
+    """
+    if hasattr(value, "tolist") and hasattr(value, "shape"):
+        shape = tuple(value.shape)
+        try:
+            few = value.tolist() if 0 not in shape and sum(shape) <= _MOST_SHOWN else None
+        except (RuntimeError, NotImplementedError, ValueError):  # there are tensors without values
+            few = None
+        return f"an array of shape {shape}" if few is None else shown(few)
+    if isinstance(value, list | tuple) and len(value) <= _MOST_SHOWN:
+        parts = ", ".join(shown(part) for part in value)
+        return f"[{parts}]" if isinstance(value, list) else f"({parts}{',' if len(value) == 1 else ''})"
+    return reprlib.repr(value)
 
 
 def counted(number: int, noun: str, plural: str | None = None) -> str:

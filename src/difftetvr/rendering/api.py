@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from difftetvr.backend import backend_for
-from difftetvr.errors import DiffTetError, MeshError
+from difftetvr.errors import DiffTetError, MeshError, shown
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.optics import ConstantPerCell, ExactLinear, OpticalModel
 from difftetvr.rendering.autograd import TRACERS, Content, RenderFunction, RenderTask
@@ -126,7 +126,7 @@ def prepare_view(
 ) -> PreparedView:
     """Check a view's inputs and bring them into camera space; arguments and errors are those of :func:`render`."""
     if not 0.0 <= transmittance_threshold < 1.0:
-        raise DiffTetError(f"transmittance_threshold is {transmittance_threshold}; it must lie in [0, 1).")
+        raise DiffTetError(f"transmittance_threshold is {shown(transmittance_threshold)}; it must lie in [0, 1).")
     camera = camera.relative_to(mesh.origin)
     content, parts = _content(mesh, field, camera)
     for tensor in parts:
@@ -196,9 +196,9 @@ def as_background(background: Any, like: torch.Tensor) -> torch.Tensor | None:
     try:
         behind = torch.as_tensor(background, dtype=like.dtype, device=like.device)
     except (TypeError, ValueError, RuntimeError) as error:
-        raise DiffTetError(f"background is {background!r}; give three linear RGB components.") from error
+        raise DiffTetError(f"background is {shown(background)}; give three linear RGB components.") from error
     if behind.shape != (3,) or not bool(torch.isfinite(behind.detach()).all()):
-        raise DiffTetError(f"background is {background!r}; give three finite linear RGB components.")
+        raise DiffTetError(f"background is {shown(background)}; give three finite linear RGB components.")
     return behind
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from difftetvr.errors import DiffTetError
+from difftetvr.errors import DiffTetError, shown
 from difftetvr.rendering.cameras.pinhole import Camera
 
 
@@ -34,10 +34,12 @@ def clip_limits(
     try:
         coefficients = torch.as_tensor(plane, dtype=like.dtype, device=like.device)
     except (TypeError, ValueError, RuntimeError) as error:
-        raise DiffTetError(f"clip_plane is {plane!r}; give the four numbers a, b, c, d.") from error
+        raise DiffTetError(f"clip_plane is {shown(plane)}; give the four numbers a, b, c, d.") from error
     values = coefficients.detach()
     if values.shape != (4,) or not bool(torch.isfinite(values).all()) or not bool(values[:3].any()):
-        raise DiffTetError(f"clip_plane is {plane!r}; give four finite numbers a, b, c, d, the first three not all 0.")
+        raise DiffTetError(
+            f"clip_plane is {shown(plane)}; give four finite numbers a, b, c, d, the first three not all 0."
+        )
     pose = camera.world_to_camera.to(like)
     normal = pose[:3, :3] @ coefficients[:3]
     offset = coefficients[3]

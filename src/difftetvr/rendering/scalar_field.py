@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import torch
 
-from difftetvr.errors import MeshError
+from difftetvr.errors import MeshError, shown
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.mesh.field import Location
 from difftetvr.optics.transfer_function import TransferFunction
@@ -50,14 +50,16 @@ class ScalarField:
             where = int(torch.nonzero(~torch.isfinite(scalar.detach()))[0])
             raise MeshError(f"Scalar {where} is not finite; correct it or leave its cells out.")
         if not (math.isfinite(self.attenuation) and self.attenuation >= 0):
-            raise MeshError(f"The attenuation is {self.attenuation}; it must be finite and not negative.")
+            raise MeshError(f"The attenuation is {shown(self.attenuation)}; it must be finite and not negative.")
         if self.value_range is not None:
             try:
                 low, high = (float(value) for value in self.value_range)
             except (TypeError, ValueError):
                 low, high = math.nan, math.nan
             if not (math.isfinite(low) and math.isfinite(high) and low < high):
-                raise MeshError(f"The range of the scalars is {self.value_range}; give two numbers, the smaller first.")
+                raise MeshError(
+                    f"The range of the scalars is {shown(self.value_range)}; give two numbers, the smaller first."
+                )
         if self.location not in (None, "vertex", "cell"):
             raise MeshError(f'The location of the scalars is {self.location!r}; pass "vertex", "cell" or None.')
 

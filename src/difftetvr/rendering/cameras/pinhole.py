@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from difftetvr.errors import CameraError
+from difftetvr.errors import CameraError, shown
 
 if TYPE_CHECKING:
     from difftetvr.backend import Backend
@@ -191,14 +191,14 @@ def _number(name: str, value: object) -> float:
     try:
         return float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError) as error:
-        raise CameraError(f"The camera's {name} is {value!r}; give a number.") from error
+        raise CameraError(f"The camera's {name} is {shown(value)}; give a number.") from error
 
 
 def _size(name: str, value: object) -> int:
     try:
         pixels = operator.index(value)  # type: ignore[arg-type]
     except TypeError as error:
-        raise CameraError(f"The camera's {name} is {value!r}; give a whole number of pixels.") from error
+        raise CameraError(f"The camera's {name} is {shown(value)}; give a whole number of pixels.") from error
     if pixels < 1:
         raise CameraError(f"The camera's {name} is {pixels} pixels; it must be at least 1.")
     return pixels
