@@ -11,12 +11,12 @@ import torch
 
 from difftetvr.capture.capture import Capture
 from difftetvr.fitting.config import FitConfig
-from difftetvr.fitting.interrupt import InterruptFlag
 from difftetvr.fitting.records.checkpoint import Checkpoint, require_no_folder
 from difftetvr.fitting.records.evaluation import evaluate
 from difftetvr.fitting.records.result import FitResult, Progress
 from difftetvr.fitting.refinement import Strategy
 from difftetvr.fitting.trainer import Trainer
+from difftetvr.interrupts import InterruptFlag
 from difftetvr.mesh.tetmesh import TetMesh
 
 
