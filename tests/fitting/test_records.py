@@ -98,7 +98,5 @@ def test_panics_for_want_of_memory_are_errors(small_capture, tmp_path, monkeypat
 @pytest.mark.parametrize("options", [{"cells": 500_000_000}, {"grid": (800, 400, 200)}], ids=str)
 def test_runs_that_cannot_fit_the_memory_are_refused_before_they_begin(small_capture, monkeypatch, options):
     monkeypatch.setattr("difftetvr.trust.free_memory", lambda: 2**34)
-    with pytest.raises(
-        FitError, match=r"^A run with [\d,]+ cells would take [\d.]+ GiB, but only 12.8 GiB of memory"
-    ):
+    with pytest.raises(FitError, match=r"^A run with [\d,]+ cells would take [\d.]+ GiB, but only 12.8 GiB of memory"):
         fit(small_capture, FitConfig(device="cpu", **options))
