@@ -1,5 +1,6 @@
 """Files appear whole or not at all."""
 
+import errno
 import os
 import shutil
 import stat
@@ -10,7 +11,15 @@ from pathlib import Path
 import pytest
 
 from difftetvr.errors import CaptureError, DiffTetError, MeshError
-from difftetvr.files import atomic_write, require_writable, require_writable_folder
+from difftetvr.files import (
+    UnlockedWarning,
+    atomic_write,
+    locked,
+    remove_leftovers,
+    require_writable,
+    require_writable_folder,
+    stem_of,
+)
 
 posix = pytest.mark.skipif(os.name != "posix", reason="permissions, limits and the words of errors are those of POSIX")
 
@@ -229,3 +238,89 @@ def test_a_body_that_does_not_know_why_it_failed(tmp_path):
     with pytest.raises(MeshError, match="4860 requested and 0 written; check"), atomic_write(tmp_path / "a", MeshError):
         raise OSError("4860 requested and 0 written")
     assert names(tmp_path) == []
+
+
+def in_another_process(code: str, *args: Path) -> subprocess.Popen:
+    source = str(Path(__file__).parents[1] / "src")
+    code = "import os, signal, sys\nfrom difftetvr.files import *\nfrom difftetvr.files import locked\n" + code
+    command = [sys.executable, "-c", code, *map(str, args)]
+    environment = {**os.environ, "PYTHONPATH": source}
+    return subprocess.Popen(command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+
+WRITES = """
+with atomic_write(sys.argv[1]) as temporary:
+    temporary.write_text("half")
+    print("writing", flush=True)
+    sys.stdin.readline()
+"""
+LOCKS = """
+with locked(sys.argv[1], Exception, "busy"):
+    print("in", flush=True)
+    sys.stdin.readline()
+"""
+
+
+@posix
+def test_what_killed_processes_left_is_swept_and_nothing_else(tmp_path):
+    target = tmp_path / "checkpoint.bin"
+    mine = [".checkpoint-notes.bin", ".checkpoint-0123456.bin", ".other-01234567.bin", "checkpoint-01234567.bin"]
+    for name in mine:
+        (tmp_path / name).write_text("mine")
+    (tmp_path / ".checkpoint-00000000.bin").mkdir()
+    dead, living = in_another_process(WRITES, target), in_another_process(WRITES, target)
+    assert [process.stdout.readline() for process in (dead, living)] == ["writing\n"] * 2
+    dead.kill()
+    dead.wait()
+    before = set(names(tmp_path))
+    with atomic_write(target) as own:
+        remove_leftovers(tmp_path, stem_of(target))
+        assert own.exists()
+        left = set(names(tmp_path))
+    assert len(before - left) == 1 and left >= {*mine, ".checkpoint-00000000.bin"}
+    living.communicate("\n")
+    assert living.returncode == 0 and target.read_text() == "half"
+    remove_leftovers(tmp_path / "none", ".*")
+
+
+def test_one_at_a_time(tmp_path):
+    target = tmp_path / "checkpoint.bin"
+    with locked(target, MeshError, "It is in use."):
+        with pytest.raises(MeshError, match="It is in use"), locked(target, MeshError, "It is in use."):
+            pytest.fail("the body must not run")
+        with locked(tmp_path / "other.bin", MeshError, "It is in use."):
+            pass
+    with locked(target, MeshError, "It is in use."):
+        pass
+    assert names(tmp_path) == []
+
+
+def test_locks_of_dead_processes_are_taken_over_and_those_of_living_ones_are_not(tmp_path):
+    target = tmp_path / "checkpoint.bin"
+    other = in_another_process(LOCKS, target)
+    assert other.stdout.readline() == "in\n"
+    with pytest.raises(DiffTetError, match="busy"), locked(target, DiffTetError, "busy"):
+        pytest.fail("the body must not run")
+    other.kill()
+    other.wait()
+    assert names(tmp_path) == ["checkpoint.bin.lock"]
+    with locked(target, DiffTetError, "busy"):
+        pass
+    assert names(tmp_path) == []
+
+
+def test_locks_need_a_folder_and_make_none(tmp_path):
+    with pytest.raises(MeshError, match="create the folder first"), locked(tmp_path / "a" / "b", MeshError, "busy"):
+        pytest.fail("the body must not run")
+    assert names(tmp_path) == []
+
+
+@pytest.mark.parametrize("error", [OSError(errno.ENOLCK, "No locks available"), NotImplementedError("no flock")])
+def test_disks_without_locks_are_used_with_a_warning(tmp_path, monkeypatch, error):
+    def fail(*args, **kwargs):
+        raise error
+
+    monkeypatch.setattr("filelock.FileLock.acquire", fail)
+    with pytest.warns(UnlockedWarning, match="has no locks"), locked(tmp_path / "a", MeshError, "busy"):
+        (tmp_path / "a").write_text("written")
+    assert (tmp_path / "a").read_text() == "written"

@@ -20,8 +20,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import torch
 
-from difftetvr.errors import BackendError
-from difftetvr.inputs import described
+from difftetvr.errors import BackendError, shown
 from difftetvr.libllvm import PATH_VARIABLE, tell_drjit
 
 tell_drjit()  # before the first import of Dr.Jit, which looks for libLLVM only then
@@ -184,7 +183,7 @@ def _started_backend(device: str, dtype: torch.dtype) -> Backend:
     try:
         torch_device = torch.device(device)
     except (RuntimeError, TypeError) as error:
-        raise BackendError(f"There is no device {described(device)}; use {devices_here()}.") from error
+        raise BackendError(f"There is no device {shown(device)}; use {devices_here()}.") from error
     name = _DEVICE_BACKENDS.get(torch_device.type)
     if name is None:
         raise BackendError(f"Device '{device}' has no Dr.Jit back end; move the tensors to 'cpu', 'cuda' or 'mps'.")

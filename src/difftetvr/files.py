@@ -1,17 +1,23 @@
-"""Writing files so that an interrupted or failed save never leaves half a file behind."""
+"""Writing files so that a failed save leaves no half a file behind, one that was killed is swept, and none meet."""
 
 from __future__ import annotations
 
 import contextlib
 import errno
 import os
+import re
 import secrets
 import stat
+import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from difftetvr.errors import DiffTetError
+
+if sys.platform != "win32":
+    import fcntl
 
 _ADVICE = {
     errno.EACCES: "choose a folder you may write to",
@@ -27,6 +33,8 @@ _ADVICE = {
     errno.EROFS: "choose a disk that is not read-only",
 }
 _PROBE_BYTES = 2**20
+_STEM_LENGTH = 40
+_NO_LOCKS_HERE = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 _OTHER_ADVICE = "check the disk or choose another folder"
 
 
@@ -59,13 +67,16 @@ def atomic_write(
     temporary = _temporary_name(target)
     try:
         mode = _replaceable_mode(target)
-        _create(temporary)
-        yield temporary
-        if fsync:
-            _flush_to_disk(temporary)
-        if mode is not None:
-            os.chmod(temporary, mode)
-        os.replace(temporary, target)
+        with contextlib.ExitStack() as life:
+            life.enter_context(_created(temporary))
+            yield temporary
+            if fsync:
+                _flush_to_disk(temporary)
+            if mode is not None:
+                os.chmod(temporary, mode)
+            if sys.platform == "win32":
+                life.close()  # There an open file cannot be renamed.
+            os.replace(temporary, target)
     except OSError as problem:
         # Libraries that count what they wrote, as numpy does, do not say why it was too little; the disk does.
         cause = problem if problem.errno else _reason_to_stop(temporary) or problem
@@ -113,19 +124,109 @@ def require_writable_folder(path: str | os.PathLike[str], error: type[DiffTetErr
         raise error(_sentence(path, problem)) from problem
 
 
+@contextmanager
+def locked(path: str | os.PathLike[str], error: type[DiffTetError], busy: str) -> Iterator[None]:
+    """Context manager that one process at a time is in, of all that name the same file.
+
+    The operating system gives the lock up when its process ends, however it ends; the file beside ``path`` that it is
+    held on may stay then, and is taken over.
+
+    Args:
+        path: The file; it need not exist, its folder must.
+        error: The exception to raise.
+        busy: What it says when another process, or another thread of this one, is in.
+
+    Raises:
+        DiffTetError: (of type ``error``) Another one is in, or no file can be created there.
+    """
+    import filelock  # Late: few commands lock anything.
+
+    file = Path(os.path.realpath(path))
+    file = file.with_name(f"{file.name}.lock")
+    lock = filelock.FileLock(file)
+    try:
+        os.stat(file.parent)  # The library would create it.
+        lock.acquire(timeout=0)
+    except filelock.Timeout:
+        raise error(busy) from None
+    except (OSError, NotImplementedError) as problem:
+        if isinstance(problem, OSError) and problem.errno not in _NO_LOCKS_HERE:
+            raise error(_sentence(path, problem)) from problem
+        warnings.warn(
+            UnlockedWarning(f"The disk of {path} has no locks; make sure that nothing else writes there."), stacklevel=3
+        )
+    try:
+        yield
+    finally:
+        # Before it is given up: whoever has opened it meanwhile sees that it is gone.
+        with contextlib.suppress(OSError):
+            file.unlink()
+        lock.release()
+
+
+class UnlockedWarning(UserWarning):
+    """A disk cannot keep two processes from writing the same files."""
+
+
+def remove_leftovers(folder: Path, stems: str) -> None:
+    """Removes what :func:`atomic_write` could not, because its process was killed.
+
+    Args:
+        folder: Where to look; it need not exist.
+        stems: Regular expression of the names, without suffix, of the files that were to be written.
+    """
+    pattern = re.compile(rf"\.(?:{stems})-[0-9a-f]{{8}}(?:\.\w+)?")
+    with contextlib.suppress(OSError):
+        for path in sorted(folder.iterdir()):
+            if pattern.fullmatch(path.name) and _is_abandoned(path):
+                path.unlink()
+
+
+def stem_of(path: Path) -> str:
+    """The regular expression for :func:`remove_leftovers` of one file."""
+    return re.escape(path.stem[:_STEM_LENGTH])
+
+
 def _temporary_name(target: Path) -> Path:
-    return target.with_name(f".{target.stem[:40]}-{secrets.token_hex(4)}{target.suffix}")
+    return target.with_name(f".{target.stem[:_STEM_LENGTH]}-{secrets.token_hex(4)}{target.suffix}")
 
 
-def _create(temporary: Path) -> None:
-    os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+@contextmanager
+def _created(temporary: Path) -> Iterator[None]:
+    """Creates a file, and holds a lock on it as a sign of life; with the process the lock ends, too."""
+    descriptor = os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o666)
+    try:
+        if sys.platform != "win32":
+            with contextlib.suppress(OSError):
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _is_abandoned(temporary: Path) -> bool:
+    """Whether nobody is writing a temporary file any more."""
+    if sys.platform == "win32":
+        return True  # What is open there cannot be removed.
+    try:
+        descriptor = os.open(temporary, os.O_RDWR | os.O_NONBLOCK | os.O_NOFOLLOW)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        return stat.S_ISREG(os.fstat(descriptor).st_mode)
+    except OSError:
+        return False
+    finally:
+        os.close(descriptor)
 
 
 def _probe(target: Path) -> None:
     """Creates and removes a file beside ``target``."""
     temporary = _temporary_name(target)
-    _create(temporary)
-    temporary.unlink()
+    with _created(temporary):
+        pass
+    temporary.unlink(missing_ok=True)
 
 
 def _reason_to_stop(temporary: Path) -> OSError | None:

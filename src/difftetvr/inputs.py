@@ -2,44 +2,16 @@
 
 from __future__ import annotations
 
-import builtins
 import operator
-import reprlib
 from typing import Any
 
 import numpy as np
 import torch
 
-from difftetvr.errors import DiffTetError
+from difftetvr.errors import DiffTetError, shown
 
 _CONVERSION_FAILS = (TypeError, ValueError, RuntimeError, OverflowError, AssertionError, ImportError)
 """What torch raises for values that make no tensor, and for devices that it was not built for."""
-
-
-class _Short(reprlib.Repr):
-    """Values as a message can show them: numbers and short texts as they are, all else by its kind and size."""
-
-    def repr_instance(self, x: Any, level: int) -> str:
-        if isinstance(x, torch.Tensor):
-            return f"a tensor of shape {tuple(x.shape)}"
-        if isinstance(x, np.ndarray):
-            return f"an array of shape {x.shape}"
-        if x is None or isinstance(x, (float, complex, bool, np.generic, torch.dtype, torch.device)):
-            return builtins.repr(x)
-        return f"the class {x.__name__}" if isinstance(x, type) else f"a {type(x).__name__}"
-
-    def repr_int(self, x: int, level: int) -> str:
-        return builtins.repr(x) if abs(x) < 10**20 else "a huge number"
-
-
-def described(value: Any) -> str:
-    """A value in a few words of one line, whatever it is: never a tensor's numbers."""
-    short = _Short()
-    short.maxstring = short.maxother = 40
-    short.maxlevel = 2
-    short.maxlist = short.maxtuple = short.maxset = short.maxdict = 4
-    text = short.repr(value)
-    return text if len(text) <= 100 else f"a {type(value).__name__} of {len(value)}"
 
 
 def require_type(value: Any, kind: type | tuple[type, ...], name: str, advice: str, error: type[DiffTetError]) -> None:
@@ -53,7 +25,7 @@ def require_type(value: Any, kind: type | tuple[type, ...], name: str, advice: s
         error: What to raise.
     """
     if not isinstance(value, kind):
-        raise error(f"{name} is {described(value)}; {advice}.")
+        raise error(f"{name} is {shown(value)}; {advice}.")
 
 
 def as_number(value: Any, name: str, error: type[DiffTetError], advice: str = "give a number") -> float:
@@ -70,7 +42,7 @@ def as_number(value: Any, name: str, error: type[DiffTetError], advice: str = "g
             raise TypeError
         return float(value.detach() if isinstance(value, torch.Tensor) else value)
     except _CONVERSION_FAILS as reason:
-        raise error(f"{name} is {described(value)}; {advice}.") from reason
+        raise error(f"{name} is {shown(value)}; {advice}.") from reason
 
 
 def as_whole(value: Any, name: str, error: type[DiffTetError], advice: str = "give a whole number") -> int:
@@ -78,7 +50,7 @@ def as_whole(value: Any, name: str, error: type[DiffTetError], advice: str = "gi
     try:
         return operator.index(value)
     except _CONVERSION_FAILS as reason:
-        raise error(f"{name} is {described(value)}; {advice}.") from reason
+        raise error(f"{name} is {shown(value)}; {advice}.") from reason
 
 
 def as_reals(
@@ -100,7 +72,7 @@ def as_reals(
             raise TypeError
         return tensor if tensor.dtype in (torch.float32, torch.float64) else tensor.to(dtype or torch.float32)
     except _CONVERSION_FAILS as reason:
-        raise error(f"{name} is {described(value)}{_kind(value)}; {advice} of real numbers.") from reason
+        raise error(f"{name} is {shown(value)}{_kind(value)}; {advice} of real numbers.") from reason
 
 
 def _kind(value: Any) -> str:
@@ -117,5 +89,5 @@ def moved(
     try:
         return tensor.to(device=device, dtype=dtype)
     except _CONVERSION_FAILS as reason:
-        target = " and ".join(described(place) for place in (device, dtype) if place is not None)
+        target = " and ".join(shown(place) for place in (device, dtype) if place is not None)
         raise error(f"Tensors cannot be brought to {target} on this machine; choose another device.") from reason

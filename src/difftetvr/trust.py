@@ -153,19 +153,20 @@ def require_modest(path: Path, size: int, what: str, error: type[DiffTetError]) 
     return most
 
 
-def require_free(size: int, what: str, advice: str, error: type[DiffTetError]) -> None:
+def require_free(size: int, what: str, advice: str, error: type[DiffTetError], free: int | None = None) -> None:
     """Checks that there is memory for something before it is made.
 
     Args:
-        size: Bytes.
+        size: Bytes, roughly.
         what: What takes them, at the beginning of the sentence.
         advice: What to do where it does not fit.
         error: The exception to raise.
+        free: Bytes that are there; default: those of the memory.
 
     Raises:
         DiffTetError: (of type ``error``) There is not.
     """
-    free = int(_SHARE_OF_FREE_MEMORY * free_memory())
+    free = int(_SHARE_OF_FREE_MEMORY * (free_memory() if free is None else free))
     if size > free:
         raise error(f"{what} would take {_bytes(size)}, but only {_bytes(free)} of memory can be used; {advice}.")
 
@@ -187,6 +188,13 @@ def free_memory() -> int:
         used = Path("/sys/fs/cgroup/memory.current").read_text(encoding="ascii").strip()
         if most.isdigit():
             free = min(free, max(int(most) - int(used), 0))
+    with contextlib.suppress(ImportError, OSError, ValueError):
+        import resource  # not on Windows
+
+        limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+        if limit != resource.RLIM_INFINITY:
+            pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+            free = min(free, max(limit - pages * resource.getpagesize(), 0))
     return free
 
 
@@ -195,7 +203,7 @@ def _shortened(text: str) -> str:
 
 
 def _bytes(count: int) -> str:
-    for unit, size in (("GiB", 2**30), ("MiB", 2**20), ("KiB", 2**10)):
+    for unit, size in (("TiB", 2**40), ("GiB", 2**30), ("MiB", 2**20), ("KiB", 2**10)):
         if count >= size:
             return f"{count / size:.3g} {unit}"
     return f"{count} bytes"

@@ -2,6 +2,7 @@
 
 import errno
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -154,6 +155,50 @@ def test_damaged_options_of_a_run(run, tmp_path, capsys, change):
     for name in change:
         (folder / "config.json").write_text(json.dumps({k: v for k, v in saved.items() if k != name}))
         assert f"option '{name}' is missing" in fails(capsys, "fit", "tooth", "-o", folder, "--resume")
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (["--cells", 500_000_000], "A run with 500,000,000 cells would take"),
+        (["--views", 10**9], "1,000,000,000 views of 24 x 24 pixels would take"),
+        (["--width", 50_000, "--height", 50_000], "10 views of 50,000 x 50,000 pixels would take"),
+    ],
+    ids=lambda value: str(value[0]),
+)
+def test_runs_that_cannot_fit_the_memory_say_what_they_would_need(tmp_path, capsys, options, sentence):
+    said = fails(capsys, "fit", "tooth", "-o", tmp_path / "out", *VIEWS, "--device", "cpu", *options)
+    assert said.startswith(f"difftetvr: {sentence}") and "of memory can be used; " in said
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_second_run_into_a_folder_is_refused_and_changes_nothing(tmp_path, capsys):
+    folder = RunFolder(tmp_path / "out")
+    with folder.claimed():
+        folder.config.write_text("of the first run")
+        before = {path.name: path.read_bytes() for path in folder.path.iterdir()}
+        for options in ([], ["--overwrite"]):
+            assert "Another run is going on" in fails(capsys, "fit", "tooth", "-o", folder.path, *VIEWS, *FIT, *options)
+        folder.config.write_text(json.dumps({"capture": "tooth", "capture_options": {}, "fit": {}}))
+        assert "Another run is going on" in fails(capsys, "fit", "tooth", "-o", folder.path, "--resume")
+        assert {path.name for path in folder.path.iterdir()} == set(before)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="only POSIX has such pipes")
+@pytest.mark.parametrize("option", ["--config", "--transfer-function", "--initial-mesh"])
+def test_pipes_and_devices_are_no_files(tmp_path, capsys, option):
+    suffix = ".vtu" if "mesh" in option else ".json"
+    pipe, device = tmp_path / f"pipe{suffix}", tmp_path / f"device{suffix}"
+    os.mkfifo(pipe)
+    device.symlink_to("/dev/zero")
+    for path in (pipe, device):
+        assert path.name in fails(capsys, "fit", "tooth", "-o", tmp_path / "out", *VIEWS, *FIT, option, path)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_mesh_larger_than_its_budget_is_told(tmp_path, capsys):
+    assert cli.main(["fit", "tooth", "-o", str(tmp_path / "out"), *VIEWS, *SHORTEST, "--cells", "1"]) == 0
+    assert "Beginning with 6 cells, more than --cells 1: this is the nearest" in capsys.readouterr().out
 
 
 def test_folder_in_place_of_the_checkpoint(run, tmp_path, capsys):

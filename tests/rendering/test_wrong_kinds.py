@@ -12,7 +12,6 @@ import torch
 from rendering.test_errors import assert_sentence
 
 from difftetvr.errors import CameraError, DiffTetError
-from difftetvr.inputs import described
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.optics import ExactLinear, SubSegments, TransferFunction
 from difftetvr.rendering import Camera, ScalarField, render
@@ -139,22 +138,3 @@ def test_arrays_lists_and_scalars_of_numpy_are_taken() -> None:
     assert all(t.dtype == torch.float32 for t in (function.scalar, function.opacity, function.color))
     scalar = ScalarField(FIELD.density.half(), function, np.float32(2.0), value_range=np.array([0, 1]))
     assert scalar.scalar.dtype == torch.float64 and scalar.value_range == (0.0, 1.0)
-
-
-@pytest.mark.parametrize(
-    ("value", "words"),
-    [
-        (torch.rand(3, 4), "a tensor of shape (3, 4)"),
-        (torch.nn.Parameter(torch.rand(3)), "a tensor of shape (3,)"),
-        (np.zeros((2, 2)), "an array of shape (2, 2)"),
-        ([torch.rand(2), None], "[a tensor of shape (2,), None]"),
-        ((1.5, True), "(1.5, True)"),
-        ([1, 2, 3, 4, 5, 6], "[1, 2, 3, 4, ...]"),
-        (CAMERA, "a Camera"),
-        (Camera, "the class Camera"),
-        ("two\nlines", r"'two\nlines'"),
-        (10**50, "a huge number"),
-    ],
-)
-def test_values_in_messages(value: Any, words: str) -> None:
-    assert described(value) == words

@@ -15,7 +15,7 @@ from difftetvr.capture.capture_file import read_capture, write_capture
 from difftetvr.capture.free_space import FreeSpace
 from difftetvr.capture.hull import silhouettes
 from difftetvr.capture.packed import Images, Masks, MixedImages, PackedImages, shapes_of
-from difftetvr.errors import CaptureError
+from difftetvr.errors import CaptureError, shown
 from difftetvr.rendering.cameras.pinhole import Camera
 
 Encoding = Literal["linear", "srgb"]
@@ -81,7 +81,9 @@ class Capture:
             raise CaptureError(f"All views of '{self.name}' are held out for testing; leave some for training.")
         self._check_bounds()
         if not (math.isfinite(self.density_unit) and self.density_unit >= 0):
-            raise CaptureError(f"The density unit of '{self.name}' is {self.density_unit}; it must not be negative.")
+            raise CaptureError(
+                f"The density unit of '{self.name}' is {shown(self.density_unit)}; it must not be negative."
+            )
         if self.density_unit == 0:
             self.density_unit = _DEFAULT_ATTENUATION / float((self.bounds[1] - self.bounds[0]).max())
 
@@ -94,7 +96,9 @@ class Capture:
         if not bool(torch.isfinite(self.bounds).all()):
             raise CaptureError(f"The bounds of '{self.name}' are not finite; give the corners of a box.")
         if not (math.isfinite(self.surroundings) and self.surroundings >= 1.0):
-            raise CaptureError(f"The surroundings of '{self.name}' are {self.surroundings}; they must be at least 1.")
+            raise CaptureError(
+                f"The surroundings of '{self.name}' are {shown(self.surroundings)}; they must be at least 1."
+            )
 
     def _check_images(self) -> None:
         shapes = shapes_of(self.images)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from difftetvr.errors import CaptureError
+from difftetvr.errors import CaptureError, shown
 from difftetvr.rendering.cameras.pinhole import Camera
 
 # The field of view of the published experiments: the image plane at distance 1 has height 1.
@@ -59,7 +59,7 @@ def random_orbit(
     """
     _check(count, radius)
     if seed < 0:
-        raise CaptureError(f"The seed is {seed}; give a non-negative integer.")
+        raise CaptureError(f"The seed is {shown(seed)}; give a non-negative integer.")
     random = np.random.default_rng(seed).random((count, 2))
     directions = _on_sphere(2.0 * random[:, 0] - 1.0, 2.0 * math.pi * random[:, 1])
     return _look_at_target(directions, target, radius, fov_y, width, height)
@@ -67,9 +67,9 @@ def random_orbit(
 
 def _check(count: int, radius: float) -> None:
     if count < 1:
-        raise CaptureError(f"The number of views is {count}; give at least one.")
+        raise CaptureError(f"The number of views is {shown(count)}; give at least one.")
     if not (math.isfinite(radius) and radius > 0):
-        raise CaptureError(f"The radius of the cameras' sphere is {radius}; it must be greater than 0.")
+        raise CaptureError(f"The radius of the cameras' sphere is {shown(radius)}; it must be greater than 0.")
 
 
 def _on_sphere(z: np.ndarray, angle: np.ndarray) -> np.ndarray:

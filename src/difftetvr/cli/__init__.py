@@ -1,6 +1,7 @@
 """The command line: ``difftetvr fit | mesh | render | compare | cut | eval | info | export | doctor``.
 
-PyTorch takes seconds to import, so only a command that runs does it: help, versions and mistyped arguments do not.
+PyTorch takes seconds to import, so only a command that runs does it: help, versions and mistyped arguments do not. All
+else that takes its time is imported by `main`, not with this module: only there does an interrupt end in good order.
 """
 
 from __future__ import annotations
@@ -10,18 +11,18 @@ import difflib
 import importlib
 import sys
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from difftetvr._version import __version__
-from difftetvr.cli.options import TrustOptions, parse
 from difftetvr.errors import DiffTetError, FitError
-from difftetvr.terminal import console, sentence_for, waiting
-from difftetvr.trust import trusting
+from difftetvr.interrupts import INTERRUPTED, OrderlyExit
 
-__all__ = ["COMMANDS", "command_type", "main", "parse_command"]
+if TYPE_CHECKING:
+    from rich.console import Console
+
+__all__ = ["COMMANDS", "command_type", "console", "main", "parse_command"]
 
 _USAGE_ERROR = 2
-_INTERRUPTED = 130
 _HELP = ("-h", "--help")
 
 COMMANDS = {
@@ -60,9 +61,10 @@ def parse_command(args: Sequence[str]) -> Any:
         args: Arguments after the program's name.
 
     Raises:
-        FitError: There is no such command, or a file that options come from cannot be read.
-        SystemExit: An argument is not valid; what is wrong with it has been printed.
+        FitError: There is no such command, an argument is not valid, or a file that options come from cannot be read.
     """
+    from difftetvr.cli.parsing import parse
+
     kind: Any = command_type(args[0])
     return parse(kind, args[0], args[1:], _saved(kind, args[1:]))
 
@@ -76,38 +78,67 @@ def main(args: Sequence[str] | None = None) -> int:
     Returns:
         The exit code: 0, 2 for bad input (one sentence on standard error), 130 when interrupted.
     """
-    given = list(sys.argv[1:] if args is None else args)
+    with OrderlyExit() as signals:
+        try:
+            return _main(list(sys.argv[1:] if args is None else args))
+        except KeyboardInterrupt:
+            return INTERRUPTED
+        except Exception:
+            if signals.raised:  # Compiled code has made another error of the interrupt.
+                return INTERRUPTED
+            raise
+
+
+def console() -> Console:
+    """Where commands print, see `difftetvr.terminal.console`."""
+    from difftetvr import terminal
+
+    return terminal.console()
+
+
+def _main(given: Sequence[str]) -> int:
+    from difftetvr.terminal import complain, finish, plain_warnings, sentence_for
+
     try:
-        if _tell(given):
-            return 0 if given else _USAGE_ERROR
-        command, out = parse_command(given), console()
-        if out.is_terminal:
-            with waiting(out, "Loading PyTorch"):
-                importlib.import_module("torch")
-        trust = getattr(command, "trust", TrustOptions())
-        with trusting(trust.allow_outside, trust.allow_large):
-            command.run(out)
+        with plain_warnings():
+            out = console()
+            if not _tell(out, given):
+                _run(out, given)
+            finish()
     except SystemExit as leave:
         return leave.code if isinstance(leave.code, int) else _USAGE_ERROR
-    except KeyboardInterrupt:
-        return _INTERRUPTED
     except Exception as error:
         sentence = sentence_for(error)
         if sentence is None:
             raise
-        print(f"difftetvr: {sentence}", file=sys.stderr)
+        complain(sentence)
         return _USAGE_ERROR
-    return 0
+    return 0 if given else _USAGE_ERROR
 
 
-def _tell(given: Sequence[str]) -> bool:
+def _run(out: Console, given: Sequence[str]) -> None:
+    """Runs the command that arguments describe."""
+    from difftetvr.cli.options import TrustOptions
+    from difftetvr.terminal import waiting
+    from difftetvr.trust import trusting
+
+    command = parse_command(given)
+    if out.is_terminal:
+        with waiting(out, "Loading PyTorch"):
+            importlib.import_module("torch")
+    trust = getattr(command, "trust", TrustOptions())
+    with trusting(trust.allow_outside, trust.allow_large):
+        command.run(out)
+
+
+def _tell(out: Console, given: Sequence[str]) -> bool:
     """Prints what arguments ask to be told without running anything; whether they did, as no arguments do."""
     if given[:1] == ["--version"]:
-        print(f"difftetvr {__version__}")
+        out.print(f"difftetvr {__version__}")
     elif not given or given[0] in _HELP:
-        from difftetvr.cli.help import print_overview  # late: commands that run need no help
+        from difftetvr.cli.help import print_overview  # commands that run need no help
 
-        print_overview(console(), {name: command_type(name) for name in COMMANDS})
+        print_overview(out, {name: command_type(name) for name in COMMANDS})
     elif any(word in _HELP for word in given[1:]):
         from difftetvr.cli.help import print_help
 
@@ -115,7 +146,7 @@ def _tell(given: Sequence[str]) -> bool:
         saved = None
         with contextlib.suppress(DiffTetError):  # help is there for whoever names the wrong file, too
             saved = _saved(kind, [word for word in given[1:] if word not in _HELP])
-        print_help(console(), given[0], kind, saved)
+        print_help(out, given[0], kind, saved)
     else:
         return False
     return True

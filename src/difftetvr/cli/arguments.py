@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import typing
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -40,6 +41,18 @@ class Argument:
     def is_required(self) -> bool:
         """Whether it must be given."""
         return _is_missing(self.value)
+
+    def flags(self, pairs: bool = False) -> list[str]:
+        """How it is written where it has a name; one that is on or off only as what it is not already.
+
+        Args:
+            pairs: Whether it may be turned on and off again.
+        """
+        on = f"--{self.name}"
+        if self.declared is not bool:
+            return [*(alias for note in settings_of(self.notes) for alias in note.aliases or ()), on]
+        off = "--" + re.sub(r"([^.]+)$", r"no-\1", self.name)
+        return [on, off] if pairs else [off if self.value else on]
 
 
 def arguments_of(kind: Any, default: Any = None, prefix: str = "") -> Iterator[Argument]:

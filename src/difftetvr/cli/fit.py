@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from difftetvr.fitting.records.result import FitResult
     from difftetvr.fitting.trainer import Trainer
 
+_NOTICEABLY = 1.1
+
 
 @dataclass(frozen=True)
 class Fit:
@@ -69,23 +71,26 @@ class Fit:
         from difftetvr.view.report import write_report
 
         folder = RunFolder(self.output)
-        self._require_same_run(folder)
-        folder.require_free(resume=self.resume, overwrite=self.overwrite)
-        views_of = self.views_of.sized_for(self.capture, self.config.device, console)
-        capture = views_of.load(self.capture, console)
-        with waiting(console, "Reading the checkpoint" if self.resume else "Making the mesh to begin with"):
-            trainer = prepare(capture, self.config, resume_from=folder.checkpoint if self.resume else None)
-        chosen = dataclasses.replace(self, config=trainer.config, views_of=views_of)
-        if capture.encoding == "srgb":
-            _print_choices(console, self.config, trainer.config)
-        if self.config.initial_mesh is not None:
-            _print_start(console, self.config.initial_mesh, trainer)
-        # Only now: what cannot even start neither leaves a folder behind nor costs the run that is to be replaced.
-        options = chosen.to_json() | ({"repair": trainer.repair} if trainer.repair else {})
-        with folder.occupied(options, overwrite=self.overwrite, begun=lambda: trainer.iteration > 0):
-            result = self._optimise(trainer, folder, console)
-        with waiting(console, f"Drawing pictures into {self.output}"):
-            write_report(folder, result, capture)
+        with folder.claimed():
+            self._require_same_run(folder)
+            folder.require_free(resume=self.resume, overwrite=self.overwrite)
+            views_of = self.views_of.sized_for(self.capture, self.config.device, console)
+            capture = views_of.load(self.capture, console)
+            with waiting(console, "Reading the checkpoint" if self.resume else "Making the mesh to begin with"):
+                trainer = prepare(capture, self.config, resume_from=folder.checkpoint if self.resume else None)
+            chosen = dataclasses.replace(self, config=trainer.config, views_of=views_of)
+            if capture.encoding == "srgb":
+                _print_choices(console, self.config, trainer.config)
+            if self.config.initial_mesh is not None:
+                _print_start(console, self.config.initial_mesh, trainer)
+            elif self.config.grid is None:
+                _print_excess(console, trainer)
+            # Only now: what cannot even start costs no run that is to be replaced.
+            options = chosen.to_json() | ({"repair": trainer.repair} if trainer.repair else {})
+            with folder.occupied(options, overwrite=self.overwrite, begun=lambda: trainer.iteration > 0):
+                result = self._optimise(trainer, folder, console)
+            with waiting(console, f"Drawing pictures into {self.output}"):
+                write_report(folder, result, capture)
         _print_summary(console, result.metrics, folder)
 
     def _optimise(self, trainer: Trainer, folder: RunFolder, console: Console) -> FitResult:
@@ -149,6 +154,16 @@ def _print_start(console: Console, path: str, trainer: Trainer) -> None:
     if not trainer.iteration:
         values = "its own colours and densities" if trainer.starts_from_field else "uniform colour and density"
         console.print(f"Beginning with {path}: {counted(trainer.mesh.num_cells, 'cell')}, {values}")
+
+
+def _print_excess(console: Console, trainer: Trainer) -> None:
+    """Says that the mesh exceeds its budget, where that is noticeable: only some numbers of cells fill a box."""
+    cells, budget = trainer.mesh.num_cells, trainer.config.budget
+    if not trainer.iteration and cells > _NOTICEABLY * budget:
+        console.print(
+            f"Beginning with {counted(cells, 'cell')}, more than --cells {budget}: this is the nearest in size of "
+            "all meshes to begin with."
+        )
 
 
 def _print_summary(console: Console, metrics: dict[str, Any], folder: RunFolder) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 import types
 import typing
 from collections.abc import Iterator
@@ -102,14 +101,10 @@ def options_of(kind: Any, default: Any = None) -> Iterator[Option]:
         if Positional in argument.notes:
             yield Option(name, shown, text, True, argument.is_required)
         elif argument.declared is bool:
-            on, off = f"--{name}", "--" + re.sub(r"([^.]+)$", r"no-\1", name)
-            flags = off if value else on
-            if default is not None:
-                flags = f"{on}, {off}"
+            flags = ", ".join(argument.flags(pairs=default is not None))
             yield Option(name, flags, f"{text} (default: {'on' if value else 'off'})", False, False)
         else:
-            aliases = [alias for note in settings for alias in note.aliases or ()]
-            flags = ", ".join(f"{flag} {shown}" for flag in (*aliases, f"--{name}"))
+            flags = ", ".join(f"{flag} {shown}" for flag in argument.flags())
             text += " (required)" if argument.is_required else _default_text(value, text)
             yield Option(name, flags, text, False, argument.is_required)
 

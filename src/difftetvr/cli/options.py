@@ -5,24 +5,15 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
-import types
-import typing
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-import tyro
-from tyro.conf import FlagCreatePairsOff, arg
-from tyro.constructors import (
-    ConstructorRegistry,
-    PrimitiveConstructorSpec,
-    PrimitiveTypeInfo,
-    UnsupportedTypeAnnotationError,
-)
+from tyro.conf import arg
 
-from difftetvr.cli.arguments import Groups, arguments_of
+from difftetvr.cli.arguments import Groups
 from difftetvr.errors import CaptureError
 from difftetvr.fitting.config import BACKGROUND_COLORS
 from difftetvr.terminal import waiting
@@ -43,8 +34,6 @@ Output = Annotated[Path, arg(aliases=["-o"])]
 
 Color = Literal["black", "white"] | tuple[float, float, float]
 """Of a background: its name, or R G B as the picture's are, linear or sRGB-encoded."""
-
-_NONE = "None"
 
 TRUST_GROUPS: Groups = {"How far files are trusted": ("allow-outside", "allow-large")}
 """Where `TrustOptions` stand in the help of a command."""
@@ -222,94 +211,3 @@ def load_model(
     assert data.field is not None
     target = resolve_device(device)
     return data.mesh.to(device=target), data.field.to(device=target)
-
-
-def parse(kind: type, name: str, args: Sequence[str], default: Any = None) -> Any:
-    """A command from arguments.
-
-    Args:
-        kind: Its dataclass.
-        name: What it is called on the command line.
-        args: The arguments after that.
-        default: Holds the values of options that are not given, ``tyro.MISSING`` where they must be; None: as declared.
-
-    Raises:
-        SystemExit: An argument is not valid; what is wrong with it has been printed.
-    """
-    # With pairs (--move, --no-move) where options come from a file: it may say either, and arguments must turn it.
-    settings = (FlagCreatePairsOff,) if default is None else ()
-    args = _positionals_first(kind, args)
-    registry = ConstructorRegistry()
-    registry.primitive_rule(_union)
-    return tyro.cli(kind, prog=f"difftetvr {name}", args=args, default=default, config=settings, registry=registry)
-
-
-def _positionals_first(kind: type, args: Sequence[str]) -> list[str]:
-    """Arguments in an order in which options that take one word or several cannot take positional ones for theirs."""
-    several = {f"--{a.name}": count for a in arguments_of(kind) if (count := _several(a.declared))}
-    left = list(args)
-    moved: list[str] = []
-    for at in reversed([i for i, word in enumerate(left) if word in several]):
-        words = 1 if left[at + 1 : at + 2] and not _is_number(left[at + 1]) else several[left[at]]
-        moved[:0] = left[at : at + 1 + words]
-        del left[at : at + 1 + words]
-    return left + moved
-
-
-def _several(declared: Any) -> int:
-    """Numbers that an option takes which may also be one word; 0 for all others."""
-    parts = typing.get_args(declared) if typing.get_origin(declared) in (typing.Union, types.UnionType) else ()
-    return max((len(typing.get_args(part)) for part in parts if typing.get_origin(part) is tuple), default=0)
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
-
-
-def _union(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | UnsupportedTypeAnnotationError | None:
-    """A value of one of several types, plainly described.
-
-    None, with which options that a file gives are left open again, is taken but not mentioned.
-    """
-    if info.type_origin not in (typing.Union, types.UnionType):
-        return None
-    specs = []
-    for part in typing.get_args(info.type):
-        spec = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(part, info.markers))
-        if not isinstance(spec, PrimitiveConstructorSpec):
-            return spec
-        specs.append(spec)
-    # None comes first: a text or a path could be made of it as well.
-    specs.sort(key=lambda spec: spec.choices != (_NONE,))
-    metavar = "|".join(spec.metavar.strip("{}").replace(",", "|") for spec in specs if spec.choices != (_NONE,))
-
-    def value_of(words: list[str]) -> Any:
-        for spec in specs:
-            with contextlib.suppress(ValueError):
-                if _fits(words, spec):
-                    return spec.instance_from_str(words)
-        raise ValueError(f"give {metavar}, not '{' '.join(words)}'")
-
-    def spec_of(value: Any) -> PrimitiveConstructorSpec[Any]:
-        return next(spec for spec in specs if spec.is_instance(value))
-
-    counts = {count for spec in specs for count in (spec.nargs if isinstance(spec.nargs, tuple) else [spec.nargs])}
-    numbers = sorted(count for count in counts if count != "*")
-    return PrimitiveConstructorSpec(
-        nargs="*" if "*" in counts else numbers[0] if len(numbers) == 1 else tuple(numbers),
-        metavar=metavar,
-        instance_from_str=value_of,
-        is_instance=lambda value: any(spec.is_instance(value) for spec in specs),
-        str_from_instance=lambda value: spec_of(value).str_from_instance(value),
-        choices=sum((spec.choices or () for spec in specs), ()) if all(spec.choices for spec in specs) else None,
-    )
-
-
-def _fits(words: list[str], spec: PrimitiveConstructorSpec[Any]) -> bool:
-    """Whether words can be a value, by their number and the choices there are."""
-    counts = spec.nargs if isinstance(spec.nargs, tuple) else (spec.nargs,)
-    return (len(words) in counts or "*" in counts) and (spec.choices is None or set(words) <= set(spec.choices))

@@ -17,6 +17,7 @@ from difftetvr.errors import DiffTetError, FitError
 from difftetvr.fitting.config import FitConfig
 from difftetvr.fitting.options import options_from_json
 from difftetvr.fitting.records.folder import RunFolder
+from difftetvr.trust import require_regular
 
 _LEFT_OPEN: dict[str, Any] = {"capture": None, "capture_options": {}, "fit": {}}
 
@@ -58,6 +59,7 @@ class SavedRun:
         """
         if path.is_dir():
             raise FitError(f"--config cannot use {path}: It is a folder; give a file, such as {path / 'config.json'}.")
+        require_regular(path, FitError)
         return _read(path, _LEFT_OPEN, f"--config cannot use {path}")
 
 

@@ -1,6 +1,5 @@
 from . import beginning as beginning
 from . import config as config
-from . import interrupt as interrupt
 from . import loop as loop
 from . import losses as losses
 from . import metrics as metrics

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -11,12 +12,12 @@ import torch
 
 from difftetvr.capture.capture import Capture
 from difftetvr.fitting.config import FitConfig
-from difftetvr.fitting.interrupt import InterruptFlag
-from difftetvr.fitting.records.checkpoint import Checkpoint, require_no_folder
+from difftetvr.fitting.records.checkpoint import Checkpoint, alone_with, require_no_folder
 from difftetvr.fitting.records.evaluation import evaluate
 from difftetvr.fitting.records.result import FitResult, Progress
 from difftetvr.fitting.refinement import Strategy
 from difftetvr.fitting.trainer import Trainer
+from difftetvr.interrupts import InterruptFlag
 from difftetvr.mesh.tetmesh import TetMesh
 
 
@@ -40,7 +41,7 @@ def fit(
         mesh: Mesh to begin with; default: that of ``config``, a file or one made for the capture.
         strategy: How the mesh is refined, for strategies of your own; default: as ``config.refine`` says.
         checkpoint: File to save the state to before the first iteration, every ``config.checkpoint_seconds``, after the
-            last one, and when interrupted by SIGINT or SIGTERM.
+            last one, and when interrupted by SIGINT, SIGTERM or SIGHUP.
         resume: Go on from ``checkpoint`` if it exists; ``mesh`` is then the checkpoint's.
         on_progress: Called after every iteration.
 
@@ -49,16 +50,17 @@ def fit(
 
     Raises:
         CaptureError: The images do not allow what the options ask for.
-        FitError: The checkpoint cannot be read, written, or is of another run, the initial mesh does not suit the
-            options or the images, or the loss is not finite.
+        FitError: The checkpoint cannot be read, written, or is of another run or of one that is going on, the initial
+            mesh does not suit the options or the images, or the loss is not finite.
         MeshError: The file of the initial mesh cannot be read or holds an invalid mesh, or the grid is too large.
         KeyboardInterrupt: The run was interrupted; the checkpoint is saved.
     """
     path = Path(checkpoint) if checkpoint is not None else None
-    trainer = prepare(
-        capture, config or FitConfig(), mesh=mesh, strategy=strategy, resume_from=path if resume else None
-    )
-    return optimise(trainer, path, on_progress)
+    with contextlib.nullcontext() if path is None else alone_with(path):
+        trainer = prepare(
+            capture, config or FitConfig(), mesh=mesh, strategy=strategy, resume_from=path if resume else None
+        )
+        return optimise(trainer, path, on_progress)
 
 
 def prepare(

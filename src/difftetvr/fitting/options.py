@@ -15,7 +15,7 @@ import types
 import typing
 from typing import Any, ClassVar, Literal, TypeVar
 
-from difftetvr.errors import FitError
+from difftetvr.errors import FitError, shown
 
 LARGEST_COUNT = 2**31 - 1
 """Greatest value of options that count something."""
@@ -32,7 +32,7 @@ def require(condition: bool, name: str, value: object, rule: str) -> None:
         FitError: The condition does not hold; names option, value and rule.
     """
     if not condition:
-        raise FitError(f"The option {name} is {value}; it must be {rule}.")
+        raise FitError(f"The option {name} is {value if isinstance(value, str) else shown(value)}; it must be {rule}.")
 
 
 class OptionGroup:

@@ -7,8 +7,8 @@ from typing import Any, Literal
 
 import torch
 
-from difftetvr.errors import MeshError, counted
-from difftetvr.inputs import as_reals, described, moved, require_type
+from difftetvr.errors import MeshError, counted, shown
+from difftetvr.inputs import as_reals, moved, require_type
 from difftetvr.mesh.harmonics import COUNTS, harmonic_basis
 from difftetvr.mesh.tetmesh import TetMesh
 
@@ -152,7 +152,7 @@ def require_location(location: Any, name: str) -> None:
         MeshError: Says what it is, and that it was passed as ``name``.
     """
     if not (location is None or (isinstance(location, str) and location in ("vertex", "cell"))):
-        raise MeshError(f'{name} is {described(location)}; pass "vertex", "cell" or None.')
+        raise MeshError(f'{name} is {shown(location)}; pass "vertex", "cell" or None.')
 
 
 def location_of(count: int, location: Location | None, mesh: TetMesh, subject: str) -> Location:

@@ -7,8 +7,8 @@ from typing import Any
 
 import torch
 
-from difftetvr.errors import MeshError
-from difftetvr.inputs import described, moved
+from difftetvr.errors import MeshError, shown
+from difftetvr.inputs import moved
 from difftetvr.mesh import quality, validation
 from difftetvr.mesh.arrays import true_indices
 from difftetvr.mesh.frame import WORLD, Origin, origin_for, reoriented
@@ -224,7 +224,7 @@ class TetMesh:
                 inverted a cell. A mesh far from its origin gets a nearer one first, see `with_origin`.
         """
         if not any(dtype is known for known in (None, torch.float32, torch.float64)):
-            raise MeshError(f"A mesh cannot have {described(dtype)} vertices; use torch.float32 or torch.float64.")
+            raise MeshError(f"A mesh cannot have {shown(dtype)} vertices; use torch.float32 or torch.float64.")
         rounds = dtype == torch.float32 and self.vertices.dtype == torch.float64
         nearer = origin_for(self.vertices) if rounds else WORLD
         near = self.vertices if nearer == WORLD else reoriented(self.vertices, WORLD, nearer, torch.float64)

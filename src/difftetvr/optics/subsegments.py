@@ -7,8 +7,8 @@ from typing import Any
 
 import drjit as dr
 
-from difftetvr.errors import DiffTetError
-from difftetvr.inputs import as_whole, described
+from difftetvr.errors import DiffTetError, shown
+from difftetvr.inputs import as_whole
 from difftetvr.optics.model import Adjoint, Weights
 from difftetvr.optics.special import constant_density, depth_of
 
@@ -32,7 +32,7 @@ class SubSegments:
     def __post_init__(self) -> None:
         count = as_whole(self.count, "The count of SubSegments", DiffTetError)
         if not 1 <= count <= 256:
-            raise DiffTetError(f"SubSegments needs a count from 1 to 256, not {described(count)}.")
+            raise DiffTetError(f"SubSegments needs a count from 1 to 256, not {shown(count)}.")
 
     def weights(self, length: Any, s0: Any, s1: Any) -> Weights:
         """See :meth:`OpticalModel.weights`."""

@@ -10,8 +10,8 @@ from typing import Any
 import torch
 
 from difftetvr.backend import backend_for, eager, require_own_threads
-from difftetvr.errors import DiffTetError, MeshError
-from difftetvr.inputs import as_number, as_reals, described, require_type
+from difftetvr.errors import DiffTetError, MeshError, shown
+from difftetvr.inputs import as_number, as_reals, require_type
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.optics import ConstantPerCell, ExactLinear, OpticalModel
 from difftetvr.rendering.autograd import TRACERS, Content, RenderFunction, RenderTask
@@ -129,7 +129,7 @@ def prepare_view(
     """Check a view's inputs and bring them into camera space; arguments and errors are those of :func:`render`."""
     _require_kinds(mesh, field, camera, optics)
     if not isinstance(renderer, str) or renderer not in RENDERERS:
-        raise DiffTetError(f"There is no renderer {described(renderer)}; choose one of {', '.join(RENDERERS)}.")
+        raise DiffTetError(f"There is no renderer {shown(renderer)}; choose one of {', '.join(RENDERERS)}.")
     require_type(deterministic, bool, "deterministic", "pass True or False", DiffTetError)
     transmittance_threshold = as_number(transmittance_threshold, "transmittance_threshold", DiffTetError)
     if not 0.0 <= transmittance_threshold < 1.0:
@@ -187,7 +187,7 @@ def _require_kinds(mesh: Any, field: Any, camera: Any, optics: Any) -> None:
     require_type(camera, Camera, "camera", "pass one difftetvr.Camera, and render each view by itself", DiffTetError)
     has_model = not isinstance(optics, type) and all(callable(getattr(optics, n, None)) for n in ("weights", "adjoint"))
     if not (optics is None or has_model):
-        raise DiffTetError(f"optics is {described(optics)}; pass a model, such as difftetvr.optics.ExactLinear().")
+        raise DiffTetError(f"optics is {shown(optics)}; pass a model, such as difftetvr.optics.ExactLinear().")
 
 
 def _content(mesh: TetMesh, field: Field | ScalarField, camera: Camera) -> tuple[Content, tuple[torch.Tensor, ...]]:
@@ -214,7 +214,7 @@ def as_background(background: Any, like: torch.Tensor) -> torch.Tensor | None:
     advice = "give a tuple or tensor"
     behind = as_reals(background, "background", DiffTetError, like.dtype, advice).to(like)
     if behind.shape != (3,) or not bool(torch.isfinite(behind.detach()).all()):
-        raise DiffTetError(f"background is {described(background)}; give three finite linear RGB components.")
+        raise DiffTetError(f"background is {shown(background)}; give three finite linear RGB components.")
     return behind
 
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import torch
 
-from difftetvr.errors import DiffTetError
-from difftetvr.inputs import as_reals, described
+from difftetvr.errors import DiffTetError, shown
+from difftetvr.inputs import as_reals
 from difftetvr.rendering.cameras.pinhole import Camera
 
 _FINITE = "give four finite numbers a, b, c, d, the first three not all 0"
@@ -38,7 +38,7 @@ def clip_limits(
     coefficients = exact.to(like)
     values = coefficients.detach()
     if values.shape != (4,) or not bool(torch.isfinite(values).all()) or not bool(values[:3].any()):
-        raise DiffTetError(f"clip_plane is {described(plane)}; {_FINITE}.")
+        raise DiffTetError(f"clip_plane is {shown(plane)}; {_FINITE}.")
     pose = camera.world_to_camera.to(like)
     # No matrix products, which torch.autocast would round.
     normal = (pose[:3, :3] * coefficients[:3]).sum(1)

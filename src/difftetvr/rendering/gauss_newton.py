@@ -7,8 +7,8 @@ from dataclasses import dataclass, fields
 import torch
 
 from difftetvr.backend import eager
-from difftetvr.errors import DiffTetError, MeshError
-from difftetvr.inputs import as_reals, described, require_type
+from difftetvr.errors import DiffTetError, MeshError, shown
+from difftetvr.inputs import as_reals, require_type
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.rendering.api import as_background, compose, prepare_view
 from difftetvr.rendering.cameras.pinhole import Camera
@@ -187,7 +187,7 @@ def model_image(
     if valid is not None and not (
         isinstance(valid, torch.Tensor) and valid.dtype == torch.bool and valid.shape == truth.shape[:2]
     ):
-        raise DiffTetError(f"valid is {described(valid)}; pass a bool tensor of shape {tuple(truth.shape[:2])}.")
+        raise DiffTetError(f"valid is {shown(valid)}; pass a bool tensor of shape {tuple(truth.shape[:2])}.")
     behind = as_background(background, mesh.vertices)
     backend, size = view.task.backend, (camera.height, camera.width)
     with backend.exclusive(one_thread=deterministic):

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import torch
 
-from difftetvr.errors import MeshError
-from difftetvr.inputs import as_number, as_reals, described, moved, require_type
+from difftetvr.errors import MeshError, shown
+from difftetvr.inputs import as_number, as_reals, moved, require_type
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.mesh.field import Location, location_of, require_location
 from difftetvr.optics.transfer_function import TransferFunction
@@ -64,7 +64,7 @@ class ScalarField:
             )
             if ends.shape != (2,) or not -math.inf < float(ends[0]) < float(ends[1]) < math.inf:
                 raise MeshError(
-                    f"The range of the scalars is {described(self.value_range)}; give two numbers, the smaller first."
+                    f"The range of the scalars is {shown(self.value_range)}; give two numbers, the smaller first."
                 )
             object.__setattr__(self, "value_range", tuple(ends.tolist()))
         require_location(self.location, "The location of the scalars")

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from PIL import Image, ImageDraw
 
-from difftetvr.errors import MeshError
+from difftetvr.errors import MeshError, shown
 from difftetvr.mesh.field import Field, Location
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.mesh.topology.topology import LOCAL_EDGES
@@ -40,7 +40,7 @@ class Plane:
         normal = np.asarray(self.normal, dtype=np.float64)
         length = np.linalg.norm(normal)
         if not (np.isfinite(length) and length > 0):
-            raise MeshError(f"The normal of the cut is {self.normal}; pass a direction other than 0.")
+            raise MeshError(f"The normal of the cut is {shown(self.normal)}; pass a direction other than 0.")
         normal = normal / length
         up = np.eye(3)[2 if abs(normal[2]) < 0.9 else 1]
         right = np.cross(up, normal)

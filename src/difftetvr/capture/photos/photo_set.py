@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import reprlib
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ import numpy as np
 
 from difftetvr.capture.photos.image_file import SUFFIXES
 from difftetvr.capture.photos.lens import Lens
-from difftetvr.errors import CaptureError
+from difftetvr.errors import CaptureError, shown
 from difftetvr.errors import CaptureWarning as CaptureWarning
 from difftetvr.trust import file_beside, require_regular
 
@@ -205,11 +204,6 @@ def numbers_of(values: object) -> np.ndarray:
         return np.array([] if values is None else values, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):  # integers of JSON may be larger than any float
         return np.empty(0)
-
-
-def shown(value: object) -> str:
-    """A value as a message shows it: shortened."""
-    return reprlib.repr(value)
 
 
 def _image_in(root: Path, name: str) -> Path | None:

@@ -16,15 +16,18 @@ from difftetvr.capture.orbit import DEFAULT_FOV_Y, fibonacci_orbit, random_orbit
 from difftetvr.capture.volumes.value_range import range_text
 from difftetvr.capture.volumes.volume import Volume
 from difftetvr.capture.volumes.volume_renderer import Progress, VolumeRenderer
-from difftetvr.errors import CameraError, CaptureError
+from difftetvr.errors import CameraError, CaptureError, counted, shown
 from difftetvr.optics.transfer_function import TransferFunction
 from difftetvr.rendering.cameras.pinhole import Camera
+from difftetvr.trust import require_free
 
 TOOTH = "tooth"
 _TOOTH_VOLUME = "tooth_103x94x161_uint8.raw.xz"
 _TOOTH_TRANSFER_FUNCTION = "tooth3gauss.json"
 # What would be stored as 0 in every picture of 8 bits.
 _LEAST_SEEN = 0.5 / 255.0
+# Colour and alpha as they are rendered, and once more apart from each other; a camera.
+_BYTES_PER_PIXEL, _BYTES_PER_VIEW = 32, 2000
 
 
 @dataclass(frozen=True)
@@ -81,11 +84,12 @@ class VolumeCapture:
             CaptureError: A file or a value is not valid, or all views are black.
             BackendError: No back end works on the device.
         """
+        self._require_memory()
         test = self._test_mask()
         cameras = self.cameras()
         volume, transfer_function = self.load_volume()
         if not self.attenuation > 0:
-            raise CaptureError(f"The attenuation is {self.attenuation}; it must be greater than 0.")
+            raise CaptureError(f"The attenuation is {shown(self.attenuation)}; it must be greater than 0.")
         renderer = VolumeRenderer(volume, transfer_function, self.attenuation, self.steps_per_unit, device)
         images, alphas = renderer.render(cameras, progress)
         if float(images.max()) < _LEAST_SEEN:
@@ -129,6 +133,15 @@ class VolumeCapture:
         except CameraError as error:
             raise CaptureError(f"The views cannot be placed: {error}") from None
         raise CaptureError(f"The orbit is '{self.orbit}'; it must be fibonacci or random.")
+
+    def _require_memory(self) -> None:
+        pixels = max(self.width, 0) * max(self.height, 0)
+        require_free(
+            max(self.views, 0) * (_BYTES_PER_VIEW + _BYTES_PER_PIXEL * pixels),
+            f"{counted(self.views, 'view')} of {self.width:,} x {self.height:,} pixels",
+            "ask for fewer or smaller ones with --views, --width and --height",
+            CaptureError,
+        )
 
     def _test_mask(self) -> torch.Tensor:
         if self.test_every == 0:

@@ -13,7 +13,7 @@ from scipy import ndimage
 from difftetvr.backend import Backend, default_device, get_backend
 from difftetvr.capture.volumes.volume import Volume
 from difftetvr.capture.volumes.volume_kernel import VolumeTables, enter_box, march
-from difftetvr.errors import CaptureError
+from difftetvr.errors import CaptureError, shown
 from difftetvr.optics.transfer_function import TransferFunction
 from difftetvr.rendering.cameras.pinhole import Camera
 
@@ -55,9 +55,9 @@ class VolumeRenderer:
         dtype: torch.dtype = torch.float32,
     ) -> None:
         if not (math.isfinite(attenuation) and attenuation >= 0):
-            raise CaptureError(f"The attenuation is {attenuation}; it must be at least 0.")
+            raise CaptureError(f"The attenuation is {shown(attenuation)}; it must be at least 0.")
         if not (math.isfinite(steps_per_unit) and steps_per_unit > 0):
-            raise CaptureError(f"The number of steps per unit is {steps_per_unit}; it must be greater than 0.")
+            raise CaptureError(f"The number of steps per unit is {shown(steps_per_unit)}; it must be greater than 0.")
         self._backend = get_backend(str(default_device() if device is None else device), dtype)
         self._tables = _tables(self._backend, volume, transfer_function, attenuation)
         nx, ny, nz = volume.resolution

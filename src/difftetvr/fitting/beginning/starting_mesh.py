@@ -15,6 +15,7 @@ from difftetvr.capture.capture import Capture
 from difftetvr.capture.hull import VisualHull
 from difftetvr.capture.viewing import Floats
 from difftetvr.errors import FitError
+from difftetvr.fitting.beginning.requirements import require_memory_for
 from difftetvr.fitting.config import FitConfig
 from difftetvr.fitting.refinement import Strategy
 from difftetvr.mesh.limits import CELLS_PER_CUBE
@@ -41,15 +42,20 @@ def starting_mesh(capture: Capture, config: FitConfig, strategy: Strategy | None
         strategy: How the mesh is refined; says how many of the budget's cells to begin with.
 
     Raises:
-        FitError: The images lack what the options ask for.
+        FitError: The images lack what the options ask for, or the memory does not suffice for the mesh.
         MeshError: The mesh would be too large.
     """
     cells = strategy.initial_cells(config.budget) if strategy else config.budget
+    require_memory_for(config.budget if config.grid is None else _cells_of(config.grid), config, strategy)
     if config.start == "hull":
         return _hull_mesh(capture, config.grid, cells)
     if config.start == "points":
         return _point_mesh(capture, cells)
     return _grid_mesh(capture, config.grid, cells)
+
+
+def _cells_of(cubes: Sequence[int]) -> int:
+    return CELLS_PER_CUBE * math.prod(cubes)
 
 
 def _grid_mesh(capture: Capture, cubes: Sequence[int] | None, cells: int) -> TetMesh:

@@ -10,6 +10,8 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,7 +22,7 @@ import torch
 
 from difftetvr.capture.capture import Capture
 from difftetvr.errors import FitError, MeshError
-from difftetvr.files import atomic_write
+from difftetvr.files import atomic_write, locked, remove_leftovers, stem_of
 from difftetvr.fitting.config import FitConfig
 from difftetvr.fitting.records.history import History
 from difftetvr.mesh.tetmesh import TetMesh
@@ -76,7 +78,13 @@ class Checkpoint:
             tensors[name] = torch.tensor(values, dtype=torch.float64)
         text = json.dumps(state)
         metadata = {"state": text, "sha256": _checksum(text, tensors)}
-        content = safetensors.torch.save(tensors, metadata=metadata)
+        try:
+            content = safetensors.torch.save(tensors, metadata=metadata)
+        except BaseException as panic:
+            # So its compiled code says that it gets no memory; that is no Exception, so nobody would tidy up.
+            if type(panic).__name__ == "PanicException":
+                raise MemoryError(str(panic)) from panic
+            raise
         with atomic_write(path, FitError) as temporary:
             temporary.write_bytes(content)
 
@@ -152,6 +160,21 @@ class Checkpoint:
                     f"'{name}' is {saved.dtype} of shape {tuple(saved.shape)}, not {tensor.dtype} of shape "
                     f"{tuple(tensor.shape)}",
                 )
+
+
+@contextmanager
+def alone_with(path: Path) -> Iterator[None]:
+    """Context manager that one run at a time is in, of all that save the same checkpoint.
+
+    What a run that was killed had written of it is removed.
+
+    Raises:
+        FitError: Another run is in, or nothing can be created there.
+    """
+    busy = f"Another run saves its checkpoint as {path}; wait for it, stop it, or choose another name."
+    with locked(path, FitError, busy):
+        remove_leftovers(path.parent, stem_of(path))
+        yield
 
 
 def require_no_folder(path: Path) -> None:

@@ -11,7 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from difftetvr.errors import FitError
-from difftetvr.files import atomic_write, require_writable_folder
+from difftetvr.files import atomic_write, locked, remove_leftovers, require_writable_folder, stem_of
+
+_PICTURES = ("truth", "reconstruction")
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,15 @@ class RunFolder:
         """Folder of single pictures of held-out views."""
         return self.path / "views"
 
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """All of these but the folder of pictures.
+
+        In this order they are removed: cut short, that never leaves a state to resume from without the options that it
+        belongs to.
+        """
+        return (self.checkpoint, self.model, self.metrics, self.curves, self.comparison, self.cut, self.config)
+
     def holds_run(self) -> bool:
         """Whether a run has written into the folder."""
         return any(p.exists() for p in (self.config, self.checkpoint, self.model, self.metrics))
@@ -76,8 +87,8 @@ class RunFolder:
             overwrite: The run in the folder will be replaced.
 
         Raises:
-            FitError: The folder holds a run and neither is set, both are, it is a file, or nothing can be created
-                in it.
+            FitError: The folder holds a run and neither is set, both are, or something stands where a file or a folder
+                of the run belongs.
         """
         if resume and overwrite:
             raise FitError("--resume and --overwrite contradict each other; give one of them.")
@@ -86,13 +97,46 @@ class RunFolder:
                 f"{self.path} already holds a run; continue it with --resume, replace it with --overwrite, or choose "
                 "another folder."
             )
+        for path in self.files:
+            if path.is_dir():
+                raise FitError(f"{path} is a folder where the {path.stem} should be a file; rename or remove it.")
+        if self.views.exists():
+            if not self.views.is_dir():
+                raise FitError(f"{self.views} is a file where the folder of pictures should be; rename or remove it.")
+            require_writable_folder(self.views, FitError)
+
+    @contextmanager
+    def claimed(self) -> Iterator[None]:
+        """Context manager that one run at a time is in: creates the folder where there is none, and sweeps it.
+
+        Swept is what runs that were killed had half written. Folders that this call created and that are empty in the
+        end are removed.
+
+        Raises:
+            FitError: Another run is in, the folder is a file, or nothing can be created in it.
+        """
         if self.path.exists() and not self.path.is_dir():
             raise FitError(f"{self.path} is a file, so no folder can have this name; choose another.")
         require_writable_folder(self.path, FitError)
+        absent = [p for p in (self.path, *self.path.parents) if not p.exists()]
+        busy = f"Another run is going on in {self.path}; wait for it, stop it, or choose another folder."
+        try:
+            try:
+                self.path.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise self._unusable(error) from error
+            with locked(self.checkpoint, FitError, busy):
+                remove_leftovers(self.path, "|".join(("probe", *map(stem_of, self.files))))
+                remove_leftovers(self.views, rf"probe|\d+_(?:{'|'.join(_PICTURES)})")
+                yield
+        finally:
+            with contextlib.suppress(OSError):
+                for folder in absent:
+                    folder.rmdir()
 
     @contextmanager
     def occupied(self, options: dict[str, Any], *, overwrite: bool, begun: Callable[[], bool]) -> Iterator[None]:
-        """Context manager for a run in the folder: creates it where there is none, and writes the options.
+        """Context manager for what a run leaves in the claimed folder; writes the options.
 
         When the body raises an error before a new run has begun, everything that this call or the body left is taken
         back, so that the next attempt finds the folder free.
@@ -103,41 +147,38 @@ class RunFolder:
             begun: Whether the run has got anywhere that is worth keeping.
 
         Raises:
-            FitError: The folder cannot be created or emptied, or the options cannot be written.
+            FitError: The folder cannot be emptied, or the options cannot be written.
         """
         is_new = overwrite or not self.holds_run()
-        absent = [p for p in (self.path, *self.path.parents) if not p.exists()]
         try:
-            try:
-                self.path.mkdir(parents=True, exist_ok=True)
-                if overwrite:
-                    self._clear()
-            except OSError as error:
-                raise FitError(f"The folder {self.path} cannot be used ({error.strerror}); choose another.") from error
+            if overwrite:
+                self._clear()
             write_json(self.config, options)
             yield
         except Exception:
             if is_new and not begun():
-                self._withdraw(absent)
+                self._withdraw()
             raise
 
     def _clear(self) -> None:
-        # The checkpoint goes first and the options last: cut short, this never leaves a state to resume from without
-        # the options that it belongs to.
-        for path in (self.checkpoint, self.model, self.metrics, self.curves, self.comparison, self.cut):
-            path.unlink(missing_ok=True)
-        for pattern in ("*_truth.png", "*_reconstruction.png"):
-            for picture in self.views.glob(pattern):
-                picture.unlink()
-        self.config.unlink(missing_ok=True)
+        try:
+            for path in self.files[:-1]:
+                path.unlink(missing_ok=True)
+            for kind in _PICTURES:
+                for picture in self.views.glob(f"*_{kind}.png"):
+                    picture.unlink()
+            self.files[-1].unlink(missing_ok=True)
+        except OSError as error:
+            raise self._unusable(error) from error
 
-    def _withdraw(self, folders: list[Path]) -> None:
-        """Removes the start of a run, and those of the given folders, innermost first, that are empty then."""
+    def _withdraw(self) -> None:
+        """Removes the start of a run."""
         with contextlib.suppress(OSError):
             self.checkpoint.unlink(missing_ok=True)
             self.config.unlink(missing_ok=True)
-            for folder in folders:
-                folder.rmdir()
+
+    def _unusable(self, error: OSError) -> FitError:
+        return FitError(f"The folder {self.path} cannot be used ({error.strerror}); choose another.")
 
 
 def write_json(path: Path, values: dict[str, Any]) -> None:

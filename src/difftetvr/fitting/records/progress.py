@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Column
 
+from difftetvr import terminal
 from difftetvr.errors import counted
 from difftetvr.fitting.records.history import RefinementRecord
 from difftetvr.fitting.records.result import Progress as Status
@@ -27,7 +28,7 @@ class ProgressDisplay:
     """
 
     def __init__(self, console: Console | None = None) -> None:
-        self._console = console or Console()
+        self._console = console or terminal.console()
         # Where both do not fit, the text is cut off, not the bar.
         bar = BarColumn(bar_width=_BAR_WIDTH, table_column=Column(min_width=_BAR_WIDTH, no_wrap=True))
         text = TextColumn("{task.fields[status]}", markup=False, table_column=Column(ratio=1, no_wrap=True))

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from difftetvr.errors import MeshError
+from difftetvr.errors import MeshError, shown
 from difftetvr.mesh.limits import CELLS_PER_CUBE, MAX_CELLS
 
 """Tetrahedra of a cube in Kuhn's subdivision."""
@@ -48,9 +48,11 @@ def grid(
             cubes are too small for the precision of dtype.
     """
     if len(shape) != 3 or any(int(n) != n or n < 1 for n in shape):
-        raise MeshError(f"The grid's shape is {tuple(shape)}; pass three numbers of cubes, each at least 1.")
+        raise MeshError(f"The grid's shape is {shown(shape)}; pass three numbers of cubes, each at least 1.")
     if len(lower) != 3 or len(upper) != 3:
-        raise MeshError(f"The grid's box goes from {lower} to {upper}; pass three coordinates for each corner.")
+        raise MeshError(
+            f"The grid's box goes from {shown(lower)} to {shown(upper)}; pass three coordinates for each corner."
+        )
     nx, ny, nz = (int(n) for n in shape)
     if 6 * nx * ny * nz > MAX_CELLS or (nx + 1) * (ny + 1) * (nz + 1) > _MAX_VERTICES:
         raise MeshError(f"A grid of {nx} x {ny} x {nz} cubes has more than {MAX_CELLS} cells; pass fewer cubes.")

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from difftetvr.errors import CameraError
-from difftetvr.inputs import as_number, as_reals, as_whole, described
+from difftetvr.errors import CameraError, shown
+from difftetvr.inputs import as_number, as_reals, as_whole
 from difftetvr.rendering.cameras.rigid import transformed
 
 if TYPE_CHECKING:
@@ -151,7 +151,7 @@ class Camera:
     def to_camera_space(self, points: torch.Tensor) -> torch.Tensor:
         """(N, 3) world-space points in camera space; differentiable in the points and the extrinsics."""
         if not isinstance(points, torch.Tensor) or not points.is_floating_point() or points.shape[1:] != (3,):
-            raise CameraError(f"The points are {described(points)}; pass a tensor of shape (N, 3).")
+            raise CameraError(f"The points are {shown(points)}; pass a tensor of shape (N, 3).")
         pose = self.world_to_camera.to(points)
         return transformed(points, pose[:3, :3], pose[:3, 3])
 
@@ -207,7 +207,7 @@ def _number(name: str, value: object) -> float:
 def _size(name: str, value: object) -> int:
     pixels = as_whole(value, f"The camera's {name}", CameraError, "give a whole number of pixels")
     if pixels < 1:
-        raise CameraError(f"The camera's {name} is {described(pixels)} pixels; it must be at least 1.")
+        raise CameraError(f"The camera's {name} is {shown(pixels)} pixels; it must be at least 1.")
     if pixels > _MOST_PIXELS:
-        raise CameraError(f"The camera's {name} is {described(pixels)} pixels; take at most {_MOST_PIXELS:,} in all.")
+        raise CameraError(f"The camera's {name} is {shown(pixels)} pixels; take at most {_MOST_PIXELS:,} in all.")
     return pixels

@@ -34,11 +34,10 @@ from difftetvr.capture.photos.photo_set import (
     number_of,
     numbers_of,
     read_json,
-    shown,
     text_of,
 )
 from difftetvr.capture.photos.poses import pose_matrix
-from difftetvr.errors import CaptureError
+from difftetvr.errors import CaptureError, shown
 
 CAMERAS_FORMAT = "difftetvr-cameras"
 

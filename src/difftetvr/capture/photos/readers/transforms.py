@@ -25,12 +25,11 @@ from difftetvr.capture.photos.photo_set import (
     numbers_of,
     pixels_of,
     read_json,
-    shown,
     text_of,
 )
 from difftetvr.capture.photos.poses import from_opengl
 from difftetvr.capture.photos.readers.ply_points import read_ply_points
-from difftetvr.errors import CaptureError
+from difftetvr.errors import CaptureError, shown
 from difftetvr.trust import file_beside
 
 _PINHOLES = ("", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL")
