@@ -201,7 +201,7 @@ def test_structured_grids_in_pieces(tmp_path, kind):
     data = load_data(tmp_path / f"a.p{suffix}", split=None)
     assert data.mesh.is_conforming and data.mesh.num_vertices == 7 * 4 * 3
     assert float(data.mesh.volumes().sum()) == pytest.approx(6 * 3 * 2 * np.prod(spacing), rel=1e-5)
-    assert np.array_equal(data.point_data["x"], data.mesh.vertices[:, 0])
+    assert np.array_equal(data.point_data["x"].to(data.mesh.vertices.dtype), data.mesh.vertices[:, 0])
     assert data.warnings == ("Merged 12 points at which its 2 pieces meet.", "Split 36 hexahedra into 216 tetrahedra.")
 
 
