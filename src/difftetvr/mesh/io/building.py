@@ -95,7 +95,8 @@ def build_mesh(request: Request, vertices: np.ndarray, tets: Tets) -> Built:
     Raises:
         MeshError: It is no valid mesh, or has flat cells where these are refused; names the file.
     """
-    points = torch.from_numpy(np.ascontiguousarray(vertices, dtype=_precision_of(vertices)))
+    # Arrays that lie in a file's bytes cannot be written to, and PyTorch warns of them.
+    points = torch.from_numpy(np.require(vertices, _precision_of(vertices), ["C", "W"]))
     try:
         built = _repaired(points, tets) if request.flat == "repair" else _valid(request, points, tets)
         return _rounded(request, built)
