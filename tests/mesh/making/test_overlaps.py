@@ -30,12 +30,20 @@ def test_boxes_overlap_or_only_touch(shift, found):
         assert 0 < overlap.share <= 1
 
 
+def test_cells_deep_inside_count_too():
+    mesh = pushed_together(0.5, 8)
+    found = overlapping_cells(mesh)
+    middles = mesh.vertices[mesh.tets.long()].mean(1)
+    assert bool(found[(middles[:, 0] > 0.6) & (middles[:, 0] < 0.9)].float().mean() > 0.9)
+    assert not found[(middles[:, 0] < 0.35) | (middles[:, 0] > 1.15)].any()
+
+
 def test_a_mesh_that_lies_twice_in_one_place():
     one = dtv.TetMesh.delaunay(torch.rand(60, 3, generator=torch.Generator().manual_seed(0)))
     twice = dtv.TetMesh(torch.cat((one.vertices,) * 2), torch.cat((one.tets, one.tets + one.num_vertices)))
     assert sampled_overlap(twice).share == 1.0
     found = overlapping_cells(twice)
-    assert found[: one.num_cells].equal(found[one.num_cells :]) and found.any()
+    assert found.all()
 
 
 @pytest.mark.parametrize(
