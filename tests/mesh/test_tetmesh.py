@@ -187,9 +187,10 @@ def test_to_another_precision():
     assert mesh.to(dtype=torch.float32, device="cpu") is mesh
     with pytest.raises(MeshError, match="float16"):
         mesh.to(dtype=torch.float16)
-    far = double.with_vertices(double.vertices + 1e9)
+    thin = double.with_vertices(double.vertices * torch.tensor([1.0, 1.0, 1e-9]) + 0.5)
+    thin.validate()
     with pytest.raises(MeshError, match="Cell 0: its volume is zero"):
-        far.to(dtype=torch.float32)
+        thin.to(dtype=torch.float32)
 
 
 def test_without_unused_vertices():
