@@ -50,7 +50,8 @@ def test_base64_with_one_stream_or_two(tmp_path):
         attributes = f'header_type="UInt{8 * struct.calcsize(header)}"'
         size = struct.pack(header, len(data))
         for text in (encoded(size + data), encoded(size, data), "\n " + "\n".join(encoded(size + data)) + "\n"):
-            assert array(tmp_path, text, 5, attributes=attributes).tolist() == VALUES.tolist()
+            values = array(tmp_path, text, 5, attributes=attributes)
+            assert values.tolist() == VALUES.tolist() and values.flags.writeable
     big = struct.pack(">I", len(data)) + VALUES.astype(">f8").tobytes()
     assert array(tmp_path, encoded(big), attributes='byte_order="BigEndian"').tolist() == VALUES.tolist()
 

@@ -147,7 +147,9 @@ class Document:
             data = self._bytes(element, size, name)
             if len(data) % dtype.itemsize:
                 raise self.damaged(f"the array {name!r} ends within a number")
-            values = np.frombuffer(data, dtype).astype(dtype.newbyteorder("="), copy=False)
+            values = np.frombuffer(data, dtype)
+            # What is the file's own, not unpacked, cannot be written to, which no one expects of an array.
+            values = values.astype(dtype.newbyteorder("="), copy=not values.flags.writeable)
             values = np.unpackbits(values, count=count) if is_bits else values
         if count is not None and len(values) != count:
             raise self.damaged(f"the array {name!r} holds {len(values)} numbers, where {count} must be")
