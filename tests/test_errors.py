@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import difftetvr as dtv
-from difftetvr.errors import DiffTetError, shown
+from difftetvr.errors import DiffTetError, listed, shown
 from difftetvr.fitting import FitConfig
 from difftetvr.mesh import TetMesh
 
@@ -38,6 +38,10 @@ from difftetvr.mesh import TetMesh
 )
 def test_values_are_shown_as_numbers(value, text):
     assert shown(value) == text
+
+
+def test_lists():
+    assert (listed(["a"]), listed(["a", "b"]), listed(("a", "b", "c"), "or")) == ("a", "a and b", "a, b or c")
 
 
 def camera():

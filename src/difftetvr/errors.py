@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import builtins
 import reprlib
+from collections.abc import Sequence
 from typing import Any
 
 _MOST_SHOWN, _LONGEST_SHOWN, _LONGEST_NUMBERS, _LARGEST_SHOWN = 8, 100, 60, 10**20
@@ -78,6 +79,16 @@ def _few_values(array: Any) -> Any:
         return array.tolist() if 0 not in shape and sum(shape) <= _MOST_SHOWN else None
     except (RuntimeError, NotImplementedError, ValueError):
         return None
+
+
+def listed(words: Sequence[str], last: str = "and") -> str:
+    """Words as a sentence lists them: a, b and c.
+
+    Args:
+        words: At least one.
+        last: What stands before the last one.
+    """
+    return f" {last} ".join((", ".join(words[:-1]), words[-1])) if len(words) > 1 else words[0]
 
 
 def counted(number: int, noun: str, plural: str | None = None) -> str:

@@ -12,7 +12,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from difftetvr.cli.arguments import Groups
 from difftetvr.cli.options import CAPTURE_GROUPS, CaptureOptions, Color, MeshOptions, TrustOptions, color_of, load_model
-from difftetvr.errors import FitError, MeshError, counted
+from difftetvr.errors import FitError, MeshError, counted, listed
 from difftetvr.files import require_writable
 from difftetvr.fitting.records.folder import RunFolder, write_json
 
@@ -136,7 +136,7 @@ class Export:
         save(self.output, data.mesh, field_on_mesh, point_data=others[0], cell_data=others[1])
         written = (*written, *sorted({*others[0], *others[1]}))
         left_out = sorted({*data.point_data, *data.cell_data}.difference(written))
-        content = " and ".join(filter(None, (", ".join(written[:-1]), *written[-1:]))) or "geometry only"
+        content = listed(written) if written else "geometry only"
         without = f", without {', '.join(left_out)}" if left_out else ""
         console.print(f"Wrote {self.output} ({counted(data.mesh.num_cells, 'cell')}, {content}{without})")
 

@@ -21,7 +21,7 @@ from tyro.constructors import (
 )
 
 from difftetvr.cli.arguments import Argument, arguments_of, settings_of
-from difftetvr.errors import FitError
+from difftetvr.errors import FitError, listed
 
 _NONE = "None"
 _IN_WORDS = {int: "a whole number", float: "a number", str: "a name or a path", Path: "a path"}
@@ -88,7 +88,7 @@ def _mistake(program: str, arguments: list[Argument], words: Sequence[str], pair
             return _wrong(argument, values)
         missing = [other for other in missing if other is not argument]
     if missing:
-        return f"'{program}' needs {' and '.join(_shown(argument) for argument in missing)}; see '{program} --help'."
+        return f"'{program}' needs {listed([_shown(argument) for argument in missing])}; see '{program} --help'."
     return f"These arguments cannot be understood; see '{program} --help'."
 
 
@@ -139,7 +139,7 @@ def _in_words(declared: Any) -> str:
     origin, parts = typing.get_origin(declared), typing.get_args(declared)
     if origin in (typing.Union, types.UnionType):
         words = [word for part in parts if part is not types.NoneType for word in _alternatives(part)]
-        return " or ".join([", ".join(words[:-1]), words[-1]]) if len(words) > 1 else words[0]
+        return listed(words, "or")
     if origin is Literal:
         return f"one of {', '.join(_alternatives(declared))}"
     if origin is tuple and parts[-1] is Ellipsis:
