@@ -4,16 +4,18 @@
 BIN := .venv/bin
 # Which scripts `make bench` runs; the studies of the Tooth and of photographs have commands of their own.
 BENCHMARKS ?= $(filter-out benchmarks/tooth%.py benchmarks/photos.py,$(wildcard benchmarks/*.py))
+FUZZ_SECONDS ?= 3600
 
 # Tests run in one process for each core, up to four: each loads PyTorch and compiles kernels of its own.
 PYTEST := $(BIN)/python -m pytest -q --durations=10 -n auto --maxprocesses=4 --dist worksteal
 
-.PHONY: help setup demo test test-all lint bench docs clean distclean
+.PHONY: help setup demo test test-all fuzz lint bench docs clean distclean
 
 help:
 	@echo 'make demo       reconstruct the Tooth CT scan from rendered views; pictures in out/demo'
 	@echo 'make test       lint, types and all tests but the slow ones'
 	@echo 'make test-all   lint, types and all tests, with more random examples'
+	@echo 'make fuzz       read damaged inputs of all kinds for an hour, or FUZZ_SECONDS'
 	@echo 'make lint       lint and types only'
 	@echo 'make bench      print the tables of docs/results.md'
 	@echo 'make docs       build the manual; begins at docs/_build/html/index.html'
@@ -36,6 +38,9 @@ test: lint
 
 test-all: lint
 	DIFFTETVR_TESTS=thorough DIFFTETVR_FUZZ=4000 $(PYTEST)
+
+fuzz: setup
+	PYTHONPATH=src:tests $(BIN)/python -m fuzz --seconds $(FUZZ_SECONDS)
 
 lint: setup
 	$(BIN)/ruff check .
