@@ -11,7 +11,14 @@ _MOST_SHOWN, _LONGEST_SHOWN, _LONGEST_NUMBERS, _LARGEST_SHOWN = 8, 100, 60, 10**
 
 
 class DiffTetError(Exception):
-    """Base of all errors raised for bad input; the command line prints its sentence and exits with code 2."""
+    """Base of all errors raised for bad input; the command line prints its sentence and exits with code 2.
+
+    The sentence is one line of plain text: control characters, such as names in files may hold, are escapes in it.
+    """
+
+    def __str__(self) -> str:
+        """The sentence."""
+        return "".join(c if c.isprintable() else builtins.repr(c)[1:-1] for c in super().__str__())
 
 
 class MeshError(DiffTetError):

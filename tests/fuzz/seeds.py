@@ -225,7 +225,7 @@ def _volumes(folder: Path) -> list[Seed]:
         SimpleITK.WriteImage(image, own / name, name == "a.nrrd")
     (own / "e.nii.gz").write_bytes(gzip.compress((own / "e.nii").read_bytes(), mtime=0))
     nibabel.Nifti2Image(values, np.eye(4)).to_filename(own / "f.nii")
-    tifffile.imwrite(own / "g.tif", values)
+    tifffile.imwrite(own / "g.tif", values, photometric="minisblack")
     np.save(own / "h.npy", values)
     (own / "i_5x4x3_int16.raw").write_bytes(values.tobytes())
     (own / "j.raw").write_bytes(values.tobytes())

@@ -30,6 +30,14 @@ def test_boxes_overlap_or_only_touch(shift, found):
         assert 0 < overlap.share <= 1
 
 
+@pytest.mark.parametrize("unit", [1e-150, 1e150, 1e307])
+def test_the_unit_of_length_does_not_matter(unit):
+    mesh = pushed_together(0.5)
+    scaled = dtv.TetMesh(mesh.vertices.double() * unit, mesh.tets)
+    assert overlapping_cells(scaled).equal(overlapping_cells(mesh))
+    assert sampled_overlap(scaled).share == sampled_overlap(mesh).share
+
+
 def test_cells_deep_inside_count_too():
     mesh = pushed_together(0.5, 8)
     found = overlapping_cells(mesh)

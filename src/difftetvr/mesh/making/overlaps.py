@@ -51,7 +51,7 @@ def sampled_overlap(mesh: TetMesh, samples: int = _SAMPLES) -> Overlap | None:
     Returns:
         What was found; None where no place lies in two cells.
     """
-    positions, tets = _arrays(mesh)
+    positions, tets, unit = _arrays(mesh)
     half_faces = np.flatnonzero(mesh.topology.cell_adjacency.cpu().numpy().ravel() < 0)
     generator = np.random.default_rng(0)
     if len(half_faces) > samples:
@@ -67,7 +67,7 @@ def sampled_overlap(mesh: TetMesh, samples: int = _SAMPLES) -> Overlap | None:
         doubled[at[_weights(positions[tets[cells]], places[at]).min(1) > _TOLERANCE]] = True
     if not doubled.any():
         return None
-    x, y, z = (places[doubled.argmax()] + np.array(mesh.origin)).tolist()
+    x, y, z = (unit * places[doubled.argmax()] + np.array(mesh.origin)).tolist()
     return Overlap(float(doubled.mean()), (x, y, z))
 
 
@@ -83,7 +83,7 @@ def overlapping_cells(mesh: TetMesh) -> torch.Tensor:
     Returns:
         (T,) bool.
     """
-    positions, tets = _arrays(mesh)
+    positions, tets, _ = _arrays(mesh)
     matching = match_faces(mesh.tets.cpu(), mesh.num_vertices)
     outer = (matching.cell_adjacency < 0).any(1).numpy()
     for half_faces in (matching.crowded, matching.folded.flatten()):
@@ -113,8 +113,11 @@ def _overlapping(positions: np.ndarray, tets: np.ndarray, many: np.ndarray, few:
     return found
 
 
-def _arrays(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-    return mesh.vertices.detach().double().cpu().numpy(), mesh.tets.cpu().numpy().astype(np.int64)
+def _arrays(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray, float]:
+    """Positions in a unit, a power of two, in which products of them do not overflow; cells; and the unit."""
+    positions = mesh.vertices.detach().double().cpu().numpy()
+    unit = 2.0 ** min(int(np.frexp(np.abs(positions).max())[1]), 1000)
+    return positions / unit, mesh.tets.cpu().numpy().astype(np.int64), unit
 
 
 def _boxes(positions: np.ndarray, tets: np.ndarray) -> Boxes:
@@ -128,7 +131,9 @@ def _weights(corners: np.ndarray, places: np.ndarray) -> np.ndarray:
     ab, cd = np.cross(a, b), np.cross(c, d)
     volumes = np.stack([(b * cd).sum(1), -(a * cd).sum(1), (d * ab).sum(1), -(c * ab).sum(1)], 1)
     total = volumes.sum(1, keepdims=True)
-    return volumes / np.where(total == 0, 1.0, total)
+    # Slivers give huge weights, and none where rounding leaves them no volume: neither lies around a place for certain.
+    with np.errstate(all="ignore"):
+        return volumes / np.where(total == 0, 1.0, total)
 
 
 def _intersect(positions: np.ndarray, one: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -162,7 +167,8 @@ def _face_separates(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     a, b, c = (one[:, k] - origin for k in (1, 2, 3))
     normals = np.stack((np.cross(b, c), np.cross(c, a), np.cross(a, b)), 2)
     volume = (a * normals[:, :, 0]).sum(1)
-    weights = (other - origin[:, None]) @ normals / volume[:, None, None]
+    with np.errstate(all="ignore"):  # of slivers that rounding leaves no volume
+        weights = (other - origin[:, None]) @ normals / volume[:, None, None]
     beyond = np.concatenate((weights, 1.0 - weights.sum(2, keepdims=True)), 2)
     width = np.minimum(1.0, np.ptp(beyond, axis=1))
     return (beyond.max(1) <= _TOLERANCE * width).any(1)
