@@ -189,13 +189,15 @@ def main() -> int:
 
 def _require_intact(seeds: list[Seed]) -> None:
     """What is intact must be read, or its damages say nothing."""
-    child = Child()
+    child, wrong = Child(), []
     try:
         for seed in seeds:
             outcome, details = child.judge(seed.kind, seed.folder / seed.name)
-            assert outcome == "content", f"{seed.kind} {seed.name}: {outcome} {details}"
+            if outcome != "content":
+                wrong.append(f"{seed.kind} {seed.name}: {outcome} {details}")
     finally:
         child.close()
+    assert not wrong, "\n".join(wrong)
 
 
 if __name__ == "__main__":
