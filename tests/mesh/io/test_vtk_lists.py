@@ -212,3 +212,14 @@ def test_an_image_may_be_turned(tmp_path):
     (tmp_path / "a.vti").write_text(text)
     lower, upper = load_data(tmp_path / "a.vti", split=True).mesh.bounds().tolist()
     assert (lower, upper) == ([5, 4, 5], [7, 5, 8])
+
+
+def test_links_in_a_circle_are_no_pieces(tmp_path):
+    (tmp_path / "a.vtu").symlink_to(tmp_path / "b.vtu")
+    (tmp_path / "b.vtu").symlink_to(tmp_path / "a.vtu")
+    path = tmp_path / "list.pvtu"
+    path.write_text(
+        '<VTKFile type="PUnstructuredGrid"><PUnstructuredGrid><Piece Source="a.vtu"/></PUnstructuredGrid></VTKFile>'
+    )
+    with pytest.raises(MeshError, match=r"list\.pvtu names .*a\.vtu"):
+        load_data(path)

@@ -70,7 +70,8 @@ def from_quaternion(quaternion: np.ndarray, translation: np.ndarray, where: str)
     Raises:
         CaptureError: A value is not finite, or the quaternion is not of length 1.
     """
-    length = float(np.linalg.norm(quaternion)) if np.isfinite(quaternion).all() else np.nan
+    # No component of a unit quaternion is larger; squares of much larger ones would overflow.
+    length = float(np.linalg.norm(quaternion)) if (np.abs(quaternion) < 2.0).all() else np.nan
     if not (abs(length - 1.0) < _ROUNDING and np.isfinite(translation).all()):
         raise CaptureError(f"The pose of {where} is no unit quaternion and finite translation; get the model anew.")
     w, x, y, z = quaternion / length

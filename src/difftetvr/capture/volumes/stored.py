@@ -53,7 +53,7 @@ class Stored:
         skip = max(self.skip, 0)
         room = (size - start) * _MOST_OF_ONE[self.encoding]
         if self.encoding == "raw":
-            count, start, skip = min(count, max(room - skip, 0)), start + skip, 0
+            count, start, skip = min(count, max(room - skip, 0)), min(start + skip, size), 0
         elif skip + count > room:
             raise CaptureError(
                 f"'{self.path}' is damaged or its header wrong: {size - start} bytes of {self.encoding} data cannot "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
@@ -88,11 +89,12 @@ class _Reader:
             raise document.damaged("files name each other without end")
         for element in elements:
             file = file_beside(document.path, element.get(key, ""), MeshError)
-            target = file.resolve()
-            if target in self._seen or target == self._path.resolve():
+            # Not Path.resolve and Path.is_file, which raise where links lead in a circle.
+            target = Path(os.path.realpath(file))
+            if target in self._seen or target == Path(os.path.realpath(self._path)):
                 raise document.damaged(f"{file.name} is named twice among its pieces")
             self._seen.add(target)
-            if not file.is_file():
+            if not os.path.isfile(file):
                 raise MeshError(f"{document.path} names {file.name}, which is not there; put it where it was.")
             self.read(file, step, depth + 1)
 
