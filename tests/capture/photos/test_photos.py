@@ -11,6 +11,7 @@ from capture.photos.photo_checks import check_bounds, check_sentence, check_view
 from capture.photos.photo_scene import (
     FOCAL,
     HEIGHT,
+    POINTS,
     WIDTH,
     dump,
     orbit,
@@ -25,8 +26,10 @@ from capture.photos.photo_scene import (
 from PIL import Image
 
 from difftetvr.capture import Capture, PackedImages, PhotoCapture, load_capture
+from difftetvr.capture.photos.bounds import point_bounds
 from difftetvr.errors import CaptureError
 from difftetvr.fitting.records.evaluation import true_image
+from difftetvr.rendering.cameras.pinhole import Camera
 
 
 def test_camera_lists(tmp_path: Path) -> None:
@@ -63,6 +66,14 @@ def test_camera_lists_may_say_what_is_held_out(tmp_path: Path) -> None:
     dump(tmp_path / "cameras.json", {"format": "difftetvr-cameras", "cameras": cameras, "bounds": [1, 2]})
     with pytest.raises(CaptureError, match="'bounds' of"):
         load_capture(tmp_path)
+
+
+def test_points_too_far_to_square_are_outliers() -> None:
+    points = np.concatenate([POINTS, [[1e200, 0.0, -1e300]]])
+    cameras = [Camera(torch.from_numpy(pose), 50.0, 50.0, 30.0, 20.0, 60, 40) for pose in orbit()]
+    with np.errstate(all="raise"):
+        box = point_bounds(points, cameras)
+    np.testing.assert_allclose(box, point_bounds(POINTS, cameras))
 
 
 @pytest.mark.parametrize("factor", [2, 3, 7])

@@ -78,7 +78,8 @@ def point_bounds(points: Floats, cameras: Sequence[Camera]) -> Floats:
     """
     middle = np.median(points, axis=0)
     farthest = np.linalg.norm(positions_of(cameras) - middle, axis=1).max()
-    near = points[np.linalg.norm(points - middle, axis=1) <= _FARTHEST_POINT * farthest]
+    with np.errstate(over="ignore"):  # what is too far to square is too far
+        near = points[np.linalg.norm(points - middle, axis=1) <= _FARTHEST_POINT * farthest]
     lower, upper = np.percentile(near if len(near) else points, (_OUTLIERS, 100 - _OUTLIERS), axis=0)
     margin = _POINT_MARGIN * float(max((upper - lower).max(), 1e-3 * farthest))
     return np.stack([lower - margin, upper + margin])

@@ -32,7 +32,7 @@ def pose_matrix(values: object, where: str) -> np.ndarray:
         raise CaptureError(f"The pose of {where} holds a value that is not finite; correct or remove that view.")
     last_row_is_off = matrix.shape == (4, 4) and np.abs(matrix[3] - (0, 0, 0, 1)).max() > _ROUNDING
     rotation = matrix[:3, :3]
-    if last_row_is_off or np.abs(rotation @ rotation.T - np.eye(3)).max() > _ROUNDING or np.linalg.det(rotation) < 0:
+    if last_row_is_off or not _is_rotation(rotation):
         raise CaptureError(
             f"The pose of {where} is not rigid (a rotation without scale or mirror, last row 0 0 0 1); "
             "orthonormalise it first."
@@ -41,6 +41,13 @@ def pose_matrix(values: object, where: str) -> np.ndarray:
     left, _, right = np.linalg.svd(rotation)
     rigid[:3, :3], rigid[:3, 3] = left @ right, matrix[:3, 3]
     return rigid
+
+
+def _is_rotation(matrix: np.ndarray) -> bool:
+    """Whether a finite matrix is orthonormal and does not mirror, but for rounding."""
+    if np.abs(matrix).max() > 1.0 + _ROUNDING:  # squares might overflow
+        return False
+    return bool(np.abs(matrix @ matrix.T - np.eye(3)).max() <= _ROUNDING and np.linalg.det(matrix) > 0)
 
 
 def inverse(rigid: np.ndarray) -> np.ndarray:

@@ -69,6 +69,7 @@ def test_colours_are_premultiplied_as_stored(tmp_path: Path) -> None:
     [
         (lambda c: c["frames"][2]["transform_matrix"][1].__setitem__(3, float("nan")), "frame 2 .* not finite"),
         (lambda c: c["frames"][1]["transform_matrix"][0].__setitem__(0, 2.0), "frame 1 .* not rigid"),
+        (lambda c: c["frames"][1]["transform_matrix"][0].__setitem__(0, 1e200), "frame 1 .* not rigid"),
         (lambda c: c["frames"][1].update(transform_matrix=[[1, 2], [3, 4]]), "frame 1 .* no 4 x 4 matrix"),
         (lambda c: c["frames"][1].update(transform_matrix="identity"), "frame 1 .* no 4 x 4 matrix"),
         (lambda c: c["frames"][0].pop("file_path"), "'file_path' of frame 0"),
