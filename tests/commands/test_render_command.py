@@ -56,6 +56,18 @@ def test_the_picture_is_that_of_the_library(simulation, tmp_path):
     assert np.array_equal(picture, np.asarray(to_picture(image)) / 255.0)
 
 
+def test_ranges_of_large_integers_are_those_of_the_file(tmp_path):
+    mesh = dtv.TetMesh.grid((3, 3, 3))
+    steps = (mesh.vertices[:, 2] * 2**11).long().numpy()
+    arrays = {"vertices": mesh.vertices.numpy(), "tets": mesh.tets.numpy()}
+    pictures = []
+    for name, offset in (("near", 0), ("far", 2**60)):
+        np.savez(tmp_path / f"{name}.npz", t=steps + offset, **arrays)
+        given = ["--scalar", "t", "--value-range", offset + 2**8, offset + 2**10]
+        pictures.append(render(tmp_path / f"{name}.npz", "-o", tmp_path / "a.png", *given, *SMALL))
+    assert pictures[0].max() > 0.2 and np.array_equal(*pictures)
+
+
 def test_all_renderers_write_the_same_picture(simulation, tmp_path):
     given = ["--scalar", "velocity", *SMALL]
     pictures = [

@@ -14,7 +14,7 @@ from difftetvr.fitting.records.history import History, MoveTotals, RefinementRec
 from difftetvr.fitting.records.progress import ProgressDisplay
 from difftetvr.fitting.records.result import Progress
 from difftetvr.mesh import Field, TetMesh
-from difftetvr.view.describe import evaluation_table, mesh_tables
+from difftetvr.view.describe import data_table, evaluation_table, mesh_tables
 from difftetvr.view.pictures import comparison, save_comparisons, save_png
 from difftetvr.view.plots import save_curves
 
@@ -175,3 +175,11 @@ def test_progress_tells_of_moves_and_refinements():
         "gain 2.0e-04 (predicted 3.0e-04)",
     ):
         assert expected in text
+
+
+def test_data_tables_show_the_whole_range_of_integers():
+    table = data_table(
+        {"id": torch.from_numpy(np.array([2**64 - 1, 3], np.uint64))}, {"n": torch.tensor([-(2**63), 7])}
+    )
+    text = text_of(table)
+    assert "3 to 18446744073709551615" in text and "-9223372036854775808 to 7" in text

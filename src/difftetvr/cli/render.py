@@ -64,8 +64,9 @@ class ScalarOptions:
             raise MeshError(f"{path}: {error}") from error
         low, high = (float(v) for v in torch.aminmax(scalar.values))
         if low == high and self.value_range is None:
+            value = low + scalar.offset
             raise MeshError(
-                f"The scalar '{scalar.name}' of {path} is {low:g} everywhere; name another, or give --value-range."
+                f"The scalar '{scalar.name}' of {path} is {value:g} everywhere; name another, or give --value-range."
             )
         if self.transfer_function is None:
             function = TransferFunction.default()
@@ -73,7 +74,10 @@ class ScalarOptions:
             function = TransferFunction.load(self.transfer_function)
         lower, upper = data.mesh.bounds()
         density = self.attenuation / float((upper - lower).max())
-        field = ScalarField(scalar.values, function, density, self.value_range, scalar.location)
+        value_range = self.value_range
+        if value_range is not None:
+            value_range = (scalar.counted_from_offset(value_range[0]), scalar.counted_from_offset(value_range[1]))
+        field = ScalarField(scalar.values, function, density, value_range, scalar.location)
         return Shown(scalar.mesh, field, scalar.name, missing_note(scalar))
 
 

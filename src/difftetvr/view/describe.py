@@ -237,7 +237,8 @@ def _point(values: list[float]) -> str:
 
 def _finite_range(values: torch.Tensor) -> str:
     if not values.is_floating_point():
-        return f"{int(values.min())} to {int(values.max())}"
+        integers = values.numpy()  # torch finds no least one of uint64
+        return f"{integers.min()} to {integers.max()}"
     finite = values[values.isfinite()]
     if not finite.numel():
         return "no finite values"

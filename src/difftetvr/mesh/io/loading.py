@@ -31,7 +31,7 @@ class MeshData:
         mesh: The mesh of the tetrahedra, without vertices that none of them uses.
         field: Colour and density, where the file has both and they can be rendered; else None.
         point_data: Arrays of one row for each vertex of the mesh: floating-point ones in the precision of the file or
-            of the mesh, whichever is higher, integers and truth values as int64.
+            of the mesh, whichever is higher, integers and truth values as int64, or as uint64 if one is too large.
         cell_data: Arrays of one row for each cell of the mesh; pieces of a cell have its row.
         warnings: Sentences about what was left out or changed.
         defects: What is wrong with the file's cells, as far as they were loaded all the same.
@@ -195,10 +195,11 @@ def _tensor(values: np.ndarray, rows: np.ndarray, dtype: torch.dtype | None) -> 
     if values.dtype.kind not in "fiub" or values.ndim == 0 or values.size == 0 or len(values) <= rows.max():
         return None
     picked = values[rows]
-    if picked.dtype.kind == "f" or (picked.dtype.itemsize == 8 and (picked > _LARGEST_INTEGER).any()):
+    if picked.dtype.kind == "f":
         found = _floats(picked)
         return found.to(dtype) if dtype == torch.float64 else found
-    return torch.from_numpy(picked.astype(np.int64))
+    is_too_large = picked.dtype.kind == "u" and (picked > _LARGEST_INTEGER).any()
+    return torch.from_numpy(picked.astype(np.uint64 if is_too_large else np.int64))
 
 
 def _picked(path: Path, arrays: dict[str, np.ndarray], name: str, rows: np.ndarray) -> np.ndarray:
