@@ -10,7 +10,7 @@ from difftetvr.errors import MeshError
 from difftetvr.mesh.io.content import Content, Output
 from difftetvr.mesh.io.formats import abaqus, bintet, exodus, medit, npz, ovm, tetgen, through_meshio, unsupported
 from difftetvr.mesh.io.formats.gmsh import reading as gmsh_reading
-from difftetvr.mesh.io.formats.vtk import legacy, lists
+from difftetvr.mesh.io.formats.vtk import legacy, lists, series
 from difftetvr.mesh.io.formats.xdmf import reading as xdmf_reading
 from difftetvr.mesh.io.formats.xdmf import writing as xdmf_writing
 from difftetvr.trust import require_regular
@@ -112,5 +112,6 @@ FORMATS: dict[str, Format] = {
     ".inp": Format(abaqus.read),
     ".mesh": Format(medit.read, through_meshio.write, holds_field=False),
     **dict.fromkeys(_VTK_XML, Format(lists.read, has_steps=True)),
+    ".series": Format(series.read, has_steps=True),
 }
 """Formats by suffix; those that are written are offered in this order."""
