@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 # Where the default camera stands, seen from the mesh: in front, to the right, a little above.
 _DEFAULT_DIRECTION = (0.45, -1.0, 0.35)
 _WORST_SHOWN = 1e-3
+_LEAST_SIZE, _MOST_SIZE = 1e-150, 1e150  # of meshes, so that squares of lengths are numbers
 
 
 @dataclass(frozen=True)
@@ -211,6 +212,11 @@ class Render:
         from difftetvr.rendering.cameras.pinhole import Camera
 
         lower, upper = mesh.bounds().double().cpu()
+        size = float((upper - lower).max())
+        if not _LEAST_SIZE < size < _MOST_SIZE:
+            raise MeshError(
+                f"{self.model} is {size:.3g} across, of which no picture can be computed; scale its positions."
+            )
         target = torch.tensor(self.target, dtype=torch.float64) if self.target else 0.5 * (lower + upper)
         eye = torch.tensor(self.eye, dtype=torch.float64) if self.eye else None
         fov_y = math.radians(self.fov)

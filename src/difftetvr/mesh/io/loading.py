@@ -65,7 +65,7 @@ def load(
         path: .vtu and the other XML files of VTK, .vtk, .msh, .mesh, .xdmf, .npz, .bintet, .ovm, .node or .ele, or
             another that the manual lists.
         dtype: Floating-point type of vertices, colours and densities. Files of this type round-trip to the bit. None:
-            float32, or float64 where rounding to that would flatten or invert a cell.
+            float32, or float64 where rounding to that would flatten or invert a cell, or lose the mesh's size.
         split: Split hexahedra, wedges, pyramids and polyhedra into tetrahedra, and straighten cells of higher order.
         flat: What becomes of cells of exactly zero volume: "drop" leaves them out, which changes no picture; "repair"
             mends the mesh so that it can be deformed, too (see `difftetvr.mesh.making.repair`); "refuse" makes them an
