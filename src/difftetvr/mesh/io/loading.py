@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 import torch
 
 from difftetvr.errors import MeshError
+from difftetvr.inputs import require_type
 from difftetvr.mesh.field import Field, Location
 from difftetvr.mesh.io.building import NO_DEFECTS, Defects, Flat, Request, build_mesh, with_overlaps
 from difftetvr.mesh.io.content import Content, require_array
@@ -84,7 +86,7 @@ def load_with_optional_field(
     path: str | Path, dtype: torch.dtype | None = None, *, split: bool = False, flat: Flat = "refuse"
 ) -> tuple[TetMesh, Field | None]:
     """Like `load`, but gives None for the field of a file that holds no ``color`` and ``density``."""
-    data, problem = _load(Request(Path(path), dtype, split, flat))
+    data, problem = _load(Request(_path(path), dtype, split, flat))
     if problem is not None:
         raise problem
     return data.mesh, data.field
@@ -98,7 +100,7 @@ def load_mesh(
     Raises:
         MeshError: As `load`, except that no data arrays are needed.
     """
-    return _load(Request(Path(path), dtype, split, flat))[0].mesh
+    return _load(Request(_path(path), dtype, split, flat))[0].mesh
 
 
 def load_data(
@@ -132,7 +134,7 @@ def load_data(
     Raises:
         MeshError: As `load`.
     """
-    request = Request(Path(path), dtype, split, flat, step, loose)
+    request = Request(_path(path), dtype, split, flat, step, loose)
     data, problem = _load(request)
     if require_field:
         if problem is not None:
@@ -147,6 +149,11 @@ def load_data(
     elif problem is not None:
         return replace(data, warnings=(*data.warnings, str(problem)))
     return data
+
+
+def _path(path: str | Path) -> Path:
+    require_type(path, (str, os.PathLike), "The mesh file", "pass its path", MeshError)
+    return Path(path)
 
 
 def _load(request: Request) -> tuple[MeshData, MeshError | None]:
