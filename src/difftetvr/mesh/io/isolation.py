@@ -109,4 +109,4 @@ def _content(said: dict[str, Any], arrays: Path) -> Content:
             {name: archive[key] for name, key in said[place]} for place in ("point_data", "cell_data")
         )
         notes = tuple(said["notes"])
-        return Content(archive[said["vertices"]], tuple(blocks), point_data, cell_data, notes, said["hidden"])
+        return Content(archive[said["vertices"]], tuple(blocks), point_data, cell_data, notes, hidden=said["hidden"])

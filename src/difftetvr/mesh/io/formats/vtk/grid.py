@@ -52,7 +52,7 @@ class Grid:
         """
         found, more = blocks(path, self.cells, self.points)
         notes = (*notes, *hidden_notes(self.hidden), *more)
-        return Content(self.points, found, self.point_data, self.cell_data, notes, self.hidden)
+        return Content(self.points, found, self.point_data, self.cell_data, notes, hidden=self.hidden)
 
 
 def visible_grid(

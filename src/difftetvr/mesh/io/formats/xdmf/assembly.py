@@ -107,7 +107,8 @@ class Assembly:
         point_data = {n: _spread(data, self.num_points) for n, data in self._data["point"].items()}
         cell_data = {n: _spread(data, self._num_cells) for n, data in self._data["cell"].items()}
         vertices = np.concatenate(arrays or [np.empty((0, 3))])
-        return Content(vertices, cells, point_data, cell_data, (*notes, *hidden_notes(left_out)), left_out)
+        notes = (*notes, *hidden_notes(left_out))
+        return Content(vertices, cells, point_data, cell_data, notes, hidden=left_out)
 
     def _hidden(self) -> np.ndarray:
         """(N,) which of all cells are not to be seen."""
