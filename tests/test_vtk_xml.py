@@ -56,6 +56,15 @@ def test_base64_with_one_stream_or_two(tmp_path):
     assert array(tmp_path, encoded(big), attributes='byte_order="BigEndian"').tolist() == VALUES.tolist()
 
 
+def test_arrays_without_a_format_are_text_or_appended(tmp_path):
+    """As VTK's reader takes them."""
+    data = struct.pack("<I", 40) + VALUES.astype("<f8").tobytes()
+    content = f'<DataArray type="Float64">{" ".join(map(repr, VALUES.tolist()))}</DataArray>'
+    content += '<DataArray type="Float64" offset="0"/>'
+    file = document(tmp_path, content, b'<AppendedData encoding="raw">_' + data + b"</AppendedData>")
+    assert [file.array(element, 5).tolist() for element in file.root[:2]] == [VALUES.tolist()] * 2
+
+
 @pytest.mark.parametrize("encoding", ["raw", "base64"])
 def test_appended_data_that_look_like_xml(tmp_path, encoding):
     """What lies between is nothing but bytes, be they tags; offsets count from behind the underscore."""

@@ -23,6 +23,7 @@ _LONG_SECONDS = 3.0
 _NARROWEST, _WIDEST, _LOWEST = 20, 500, 5
 # C0 and C1 codes but line breaks, what turns the direction of writing, other line breaks, halves of characters.
 _CONTROLS = re.compile(r"[\x00-\x09\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+_ENDLESS = re.compile(r"(\S{100})\S{800,}(\S{100})")
 _NO_MEMORY = "There is not enough memory; use fewer cells, or fewer or smaller views."
 # Torch's and Dr.Jit's allocators raise RuntimeErrors like any others; only their words tell them apart.
 _ALLOCATION = re.compile(
@@ -195,5 +196,5 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 
 def _one_line(text: str) -> str:
-    """The text with line breaks, too, as escapes."""
-    return printable(text).replace("\n", "\\n")
+    """The text with line breaks, too, as escapes, and without the middles of endless words, such as wrong paths."""
+    return _ENDLESS.sub(r"\1...\2", printable(text).replace("\n", "\\n"))

@@ -39,6 +39,7 @@ _TYPES = {
     "Float64": "f8",
 }
 _BIT = "Bit"
+_ID = "vtkIdType"  # of 8 bytes, or of 4, as VTK was built
 
 _MOST_ELEMENTS = 1_000_000
 _MOST_RATIO = {"vtkZLibDataCompressor": 1_100, "vtkLZ4DataCompressor": 300, "vtkLZMADataCompressor": 20_000}
@@ -51,7 +52,7 @@ Unpack = Callable[[Any, int], bytes]
 
 def is_numeric(array: Element) -> bool:
     """Whether a DataArray holds numbers, not text or things that only VTK knows."""
-    return array.get("type") in (*_TYPES, _BIT)
+    return array.get("type") in (*_TYPES, _BIT, _ID)
 
 
 class Document:
@@ -139,12 +140,14 @@ class Document:
         if not is_numeric(element):
             raise self.damaged(f"the array {name!r} is of type {kind[:40]!r}, where numbers must be")
         is_bits = kind == _BIT
-        dtype = np.dtype(self._order + _TYPES.get(kind, "u1"))
-        if element.get("format") == "ascii":
+        dtype = np.dtype(self._order + (_TYPES | {_ID: "i8"}).get(kind, "u1"))
+        if _storage(element) == "ascii":
             values = self._parsed_numbers(element.text or "", dtype.newbyteorder("="), name)
         else:
             size = None if count is None else -(-count // 8) if is_bits else count * dtype.itemsize
-            data = self._bytes(element, size, name)
+            data = self._bytes(element, None if kind == _ID else size, name)
+            if kind == _ID and size is not None and 2 * len(data) == size:
+                dtype = np.dtype(self._order + "i4")
             if len(data) % dtype.itemsize:
                 raise self.damaged(f"the array {name!r} ends within a number")
             values = np.frombuffer(data, dtype)
@@ -187,7 +190,7 @@ class Document:
 
     def _bytes(self, element: Element, size: int | None, name: str) -> Any:
         """What a binary array holds, unpacked: ``size`` bytes, or as many as it says."""
-        if element.get("format") == "appended":
+        if _storage(element) == "appended":
             offset = self.count(element, "offset")
             if offset >= len(self._appended):
                 raise self.damaged(f"the array {name!r} begins behind the file's end")
@@ -226,6 +229,14 @@ class Document:
             raise self.damaged(f"the array {name!r} announces {total} bytes, which its {packed} cannot unpack to")
         self._unpacked += total
         require_modest(self.path, self._unpacked, "arrays", self._error)
+
+
+def _storage(array: Element) -> str:
+    """Where an array's numbers are, "ascii", "binary" or "appended"; as VTK has it where the file does not say."""
+    found = array.get("format", "").strip().lower()
+    if not found and array.get("offset") is not None:
+        return "appended"
+    return found if found in ("binary", "appended") else "ascii"
 
 
 class _Builder(ElementTree.TreeBuilder):

@@ -159,6 +159,7 @@ def test_bad_input_is_one_sentence_and_code_2(run, tmp_path, capsys):
     fails(capsys, "render", model, "-o", tmp_path / "a.png", "--width", 10**30)
     assert "'meta'" in fails(capsys, "render", model, "-o", tmp_path / "a.png", "--device", "meta")
     assert "'meta'" in fails(capsys, "fit", "tooth", "-o", out, "--device", "meta", *VIEWS)
+    assert "'cpu:99'" in fails(capsys, "render", model, "-o", tmp_path / "a.png", "--device", "cpu:99")
     assert "cells" in fails(capsys, "fit", "tooth", "-o", out, "--cells", 10**23, *VIEWS)
     assert "no capture that is known" in fails(capsys, "info", tmp_path)
     fails(capsys, "eval", model, "nothing.nrrd")

@@ -66,6 +66,14 @@ def test_mistakes_of_the_program_are_not_hidden(run, monkeypatch):
         cli.main(["info", str(run / "model.vtu")])
 
 
+@pytest.mark.parametrize("command", ["info", "render", "export"])
+def test_endless_names_are_cut(command, capsys):
+    name = "x" * 5000
+    outputs = {"info": [], "render": ["-o", "a.png"], "export": ["a.vtu"]}[command]
+    for path in (f"{name}.vtu", f"{name}.nrrd", name):
+        assert len(fails(capsys, command, path, *outputs)) < 400
+
+
 SHORTEST = ["--cells", "500", "--iterations", "1", "--refine", "none", "--device", "cpu"]
 
 

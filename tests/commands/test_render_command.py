@@ -4,6 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
+import torch
 from commands.helpers import fails
 from PIL import Image
 
@@ -54,6 +55,39 @@ def test_the_picture_is_that_of_the_library(simulation, tmp_path):
     from difftetvr.view.pictures import to_picture
 
     assert np.array_equal(picture, np.asarray(to_picture(image)) / 255.0)
+
+
+@pytest.mark.parametrize("size", [1e-140, 1e-42, 1e38, 1e140])
+def test_pictures_do_not_depend_on_the_unit_of_length(tmp_path, size, capsys):
+    mesh = dtv.TetMesh.grid((2, 2, 2), dtype=torch.float64)
+    pictures = []
+    for factor in (1.0, size):
+        points = factor * mesh.vertices.numpy()
+        points = points.astype(np.float32) if 1e-45 < factor < 1e39 else points
+        np.savez(tmp_path / "a.npz", vertices=points, tets=mesh.tets.numpy(), p=mesh.vertices[:, 0].numpy())
+        pictures.append(render(tmp_path / "a.npz", "-o", tmp_path / "a.png", *SMALL))
+    assert pictures[0].max() > 0.2 and np.abs(pictures[1] - pictures[0]).max() < 0.01
+    assert capsys.readouterr().out.count("Kept in double precision, as single precision does not hold") == 1
+
+
+@pytest.mark.parametrize("size", [1e-200, 1e155, 1e300])
+def test_sizes_that_no_picture_can_be_computed_of_are_named(tmp_path, size, capsys):
+    mesh = dtv.TetMesh.grid((1, 1, 1), dtype=torch.float64)
+    np.savez(tmp_path / "a.npz", vertices=size * mesh.vertices.numpy(), tets=mesh.tets.numpy(), p=np.arange(8.0))
+    message = fails(capsys, "render", tmp_path / "a.npz", "-o", tmp_path / "a.png", *SMALL)
+    assert f"a.npz is {size:.3g} across, of which no picture can be computed; scale its positions." in message
+
+
+def test_ranges_of_large_integers_are_those_of_the_file(tmp_path):
+    mesh = dtv.TetMesh.grid((3, 3, 3))
+    steps = (mesh.vertices[:, 2] * 2**11).long().numpy()
+    arrays = {"vertices": mesh.vertices.numpy(), "tets": mesh.tets.numpy()}
+    pictures = []
+    for name, offset in (("near", 0), ("far", 2**60)):
+        np.savez(tmp_path / f"{name}.npz", t=steps + offset, **arrays)
+        given = ["--scalar", "t", "--value-range", offset + 2**8, offset + 2**10]
+        pictures.append(render(tmp_path / f"{name}.npz", "-o", tmp_path / "a.png", *given, *SMALL))
+    assert pictures[0].max() > 0.2 and np.array_equal(*pictures)
 
 
 def test_all_renderers_write_the_same_picture(simulation, tmp_path):

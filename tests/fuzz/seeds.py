@@ -125,6 +125,7 @@ def _vtk_files(folder: Path) -> list[Path]:
     contents = {
         "pieces.pvtu": f'<VTKFile type="PUnstructuredGrid"><PUnstructuredGrid>{piece}</PUnstructuredGrid></VTKFile>',
         "steps.pvd": f'<VTKFile type="Collection"><Collection>{steps}</Collection></VTKFile>',
+        "steps.vtu.series": '{"file-series-version": "1.0", "files": [{"name": "beside0.vtu", "time": 0.5}]}',
         "image.vti": f'<VTKFile type="ImageData"><ImageData Spacing="1 2 3">{image}</ImageData></VTKFile>',
         "polyhedra.vtu": POLYHEDRA.format(faces),
     }
@@ -188,7 +189,7 @@ def _meshes(folder: Path) -> list[Seed]:
             and path.suffix != file.suffix
             and (path.suffix != ".ele" or file.suffix == ".node")
         ]
-        beside += [file.parent / "beside0.vtu"] * (file.suffix in (".pvtu", ".pvd"))
+        beside += [file.parent / "beside0.vtu"] * (file.suffix in (".pvtu", ".pvd", ".series"))
         own = folder / f"mesh {file.name}"
         own.mkdir()
         for path in beside:

@@ -13,7 +13,7 @@ pytest.importorskip("resource", reason="limits of memory are those of POSIX")
 
 ROOT = Path(__file__).parents[2]
 COUNT = int(os.environ.get("DIFFTETVR_FUZZ", "400"))
-MESHES = (".bintet", ".mesh", ".msh", ".node", ".npz", ".ovm", ".vtk", ".vtu", ".pvd", ".vti")
+MESHES = (".bintet", ".mesh", ".msh", ".node", ".npz", ".ovm", ".vtk", ".vtu", ".pvd", ".series", ".vti")
 
 
 def test_damaged_inputs_give_content_or_a_sentence():

@@ -227,3 +227,20 @@ def test_wrong_number_of_scalars() -> None:
     scene = SCENES["grid"]()
     with pytest.raises(MeshError, match="There are 3 scalars"):
         image_of(scene, ScalarField(torch.zeros(3), transfer_function()))
+
+
+@pytest.mark.parametrize(
+    ("dtype", "size"),
+    [(torch.float32, 3.3e38), (torch.float32, 1e300), (torch.float64, 1.7e308), (torch.float32, 1e-50)],
+)
+def test_ranges_that_no_number_spans(dtype: torch.dtype, size: float) -> None:
+    expected = torch.linspace(0.0, 1.0, 9, dtype=torch.float64)
+    scalar = ((2.0 * expected - 1.0) * min(size, torch.finfo(dtype).max)).to(dtype)
+    found = ScalarField(scalar, transfer_function(), value_range=(-size, size)).normalised()
+    if 1e-40 < size < 1e39 or dtype == torch.float64:
+        assert torch.allclose(found.double(), expected)
+        assert torch.equal(ScalarField(scalar, transfer_function()).normalised(), found)
+    elif size > 1.0:
+        assert torch.allclose(found, torch.tensor(0.5))
+    assert found.isfinite().all()
+    assert ScalarField(scalar, transfer_function(), value_range=(0.0, 1e-30)).normalised().isfinite().all()

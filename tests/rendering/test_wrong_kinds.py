@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from rendering.test_errors import assert_sentence
 
 from difftetvr.errors import CameraError, DiffTetError
 from difftetvr.mesh import Field, TetMesh
+from difftetvr.mesh.io import load, load_data, load_mesh
 from difftetvr.optics import ExactLinear, SubSegments, TransferFunction
 from difftetvr.rendering import Camera, ScalarField, render
 from difftetvr.rendering.gauss_newton import model_image
@@ -56,6 +58,11 @@ CALLS: dict[str, tuple[Callable[..., Any], dict[str, Any], tuple[str, ...]]] = {
     "with_size": (CAMERA.with_size, {"width": 8, "height": 8}, ("width", "height")),
     "with_pose": (CAMERA.with_pose, {}, ("world_to_camera",)),
     "to_camera_space": (CAMERA.to_camera_space, {}, ("points",)),
+    "TetMesh": (TetMesh, {"vertices": MESH.vertices, "tets": MESH.tets}, ("vertices", "tets")),
+    "delaunay": (TetMesh.delaunay, {}, ("points",)),
+    "load": (load, {}, ("path",)),
+    "load_data": (load_data, {}, ("path",)),
+    "load_mesh": (load_mesh, {}, ("path",)),
     "Field": (Field, {"color": FIELD.color, "density": FIELD.density}, ("color", "density", "location", "harmonics")),
     "ScalarField": (
         ScalarField,
@@ -105,6 +112,22 @@ def test_junk_is_refused_in_one_sentence(call: str, name: str) -> None:
 def test_the_argument_is_named(change: dict[str, Any], words: str) -> None:
     with pytest.raises(DiffTetError, match=words):
         render(**{**RENDER, **change})
+
+
+@pytest.mark.parametrize("name", ["a" * 5000 + ".vtu", "/".join(["folder"] * 1000), "a\0b.vtu", "a" * 200 + ".vtu"])
+def test_names_that_no_file_can_have_are_no_files(name: str) -> None:
+    for path in (name, Path(name)):
+        with pytest.raises(DiffTetError, match=r"There is no mesh file .*; check the path\.") as error:
+            load(path)
+        assert_sentence(error.value)
+
+
+@pytest.mark.parametrize("vertices", [MESH.vertices.to("meta"), MESH.vertices.to_sparse()])
+def test_meshes_need_tensors_that_hold_their_values(vertices: torch.Tensor) -> None:
+    with pytest.raises(DiffTetError, match=r"The vertices are a torch\.\w+ tensor on '\w+'.*; pass a dense tensor"):
+        TetMesh(vertices, MESH.tets)
+    with pytest.raises(DiffTetError, match=r"The cells are a torch\.strided tensor on 'meta'"):
+        TetMesh(MESH.vertices, MESH.tets.to("meta"))
 
 
 def test_batches_of_values_are_refused() -> None:

@@ -14,7 +14,7 @@ from difftetvr.fitting.records.history import History, MoveTotals, RefinementRec
 from difftetvr.fitting.records.progress import ProgressDisplay
 from difftetvr.fitting.records.result import Progress
 from difftetvr.mesh import Field, TetMesh
-from difftetvr.view.describe import evaluation_table, mesh_tables
+from difftetvr.view.describe import data_table, evaluation_table, mesh_tables
 from difftetvr.view.pictures import comparison, save_comparisons, save_png
 from difftetvr.view.plots import save_curves
 
@@ -75,7 +75,8 @@ def test_mesh_tables_say_what_the_mesh_holds():
     text = text_of(*mesh_tables("a.vtu", mesh, Field(torch.rand(144, 3), torch.full((144,), 7.0), location="cell")))
     for expected in ("a.vtu", "144", "60", "(0, 0, 0) to (1, 1, 1)", "per cell, 7 to 7", "quality Q"):
         assert expected in text
-    assert "none (geometry only)" in text_of(*mesh_tables("a.vtu", mesh, None))
+    without = text_of(mesh_tables("a.vtu", mesh, None)[0])
+    assert any("color and density" in line and "none" in line for line in without.splitlines())
 
 
 def test_names_in_tables_are_no_markup():
@@ -175,3 +176,11 @@ def test_progress_tells_of_moves_and_refinements():
         "gain 2.0e-04 (predicted 3.0e-04)",
     ):
         assert expected in text
+
+
+def test_data_tables_show_the_whole_range_of_integers():
+    table = data_table(
+        {"id": torch.from_numpy(np.array([2**64 - 1, 3], np.uint64))}, {"n": torch.tensor([-(2**63), 7])}
+    )
+    text = text_of(table)
+    assert "3 to 18446744073709551615" in text and "-9223372036854775808 to 7" in text

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 # Where the default camera stands, seen from the mesh: in front, to the right, a little above.
 _DEFAULT_DIRECTION = (0.45, -1.0, 0.35)
 _WORST_SHOWN = 1e-3
+_LEAST_SIZE, _MOST_SIZE = 1e-150, 1e150  # of meshes, so that squares of lengths are numbers
 
 
 @dataclass(frozen=True)
@@ -64,8 +65,9 @@ class ScalarOptions:
             raise MeshError(f"{path}: {error}") from error
         low, high = (float(v) for v in torch.aminmax(scalar.values))
         if low == high and self.value_range is None:
+            value = low + scalar.offset
             raise MeshError(
-                f"The scalar '{scalar.name}' of {path} is {low:g} everywhere; name another, or give --value-range."
+                f"The scalar '{scalar.name}' of {path} is {value:g} everywhere; name another, or give --value-range."
             )
         if self.transfer_function is None:
             function = TransferFunction.default()
@@ -73,7 +75,10 @@ class ScalarOptions:
             function = TransferFunction.load(self.transfer_function)
         lower, upper = data.mesh.bounds()
         density = self.attenuation / float((upper - lower).max())
-        field = ScalarField(scalar.values, function, density, self.value_range, scalar.location)
+        value_range = self.value_range
+        if value_range is not None:
+            value_range = (scalar.counted_from_offset(value_range[0]), scalar.counted_from_offset(value_range[1]))
+        field = ScalarField(scalar.values, function, density, value_range, scalar.location)
         return Shown(scalar.mesh, field, scalar.name, missing_note(scalar))
 
 
@@ -207,6 +212,11 @@ class Render:
         from difftetvr.rendering.cameras.pinhole import Camera
 
         lower, upper = mesh.bounds().double().cpu()
+        size = float((upper - lower).max())
+        if not _LEAST_SIZE < size < _MOST_SIZE:
+            raise MeshError(
+                f"{self.model} is {size:.3g} across, of which no picture can be computed; scale its positions."
+            )
         target = torch.tensor(self.target, dtype=torch.float64) if self.target else 0.5 * (lower + upper)
         eye = torch.tensor(self.eye, dtype=torch.float64) if self.eye else None
         fov_y = math.radians(self.fov)

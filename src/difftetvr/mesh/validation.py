@@ -187,6 +187,9 @@ def check_positive(vertices: torch.Tensor, tets: torch.Tensor) -> None:
 
 def _as_tensor(values: Any, what: str) -> torch.Tensor:
     if isinstance(values, torch.Tensor):
+        if values.layout != torch.strided or values.device.type == "meta":
+            kind = f"{values.layout} tensor on '{values.device}'"
+            raise MeshError(f"{what} are a {kind}, which does not hold them one by one; pass a dense tensor.")
         return values
     try:
         array = np.asarray(values)

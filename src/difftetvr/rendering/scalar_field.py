@@ -85,7 +85,13 @@ class ScalarField:
     def normalised(self) -> torch.Tensor:
         """The scalars in units of the range, so that the transfer function's [0, 1] spans it; differentiable."""
         low, high = self.value_range or (float(v) for v in torch.aminmax(self.scalar.detach()))
-        return (self.scalar - low) / (high - low if high > low else 1.0)
+        limits = torch.finfo(self.scalar.dtype)
+        # The difference of two numbers may overflow, that of their halves, quarters, ... does not.
+        exponent = math.frexp(max(abs(low), abs(high)))[1]
+        unit = 2.0 ** min(math.frexp(limits.max)[1] - 1 - exponent, 0)
+        extent = max(unit * high - unit * low, limits.tiny) if high > low else 1.0
+        # Infinite ones could not be interpolated; they lie so far outside that it makes no difference.
+        return ((unit * self.scalar - unit * low) / extent).nan_to_num(posinf=limits.max / 4, neginf=-limits.max / 4)
 
     def as_field(self) -> Field:
         """Colour and density at the vertices or cells themselves.

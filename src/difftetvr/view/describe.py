@@ -71,7 +71,7 @@ def mesh_tables(name: str, mesh: TetMesh, field: Field | None, defects: Defects 
         table.add_row("counted from", f"{_point(list(mesh.origin))}, as it lies far from (0, 0, 0)")
     table.add_row("volume", f"{float(mesh.volumes().double().sum()):.6g}")
     if field is None:
-        table.add_row("attributes", "none (geometry only)")
+        table.add_row("color and density", "none")
     else:
         location = field.location_on(mesh)
         table.add_row("color", f"per {location}, {_range(field.color)}")
@@ -237,7 +237,8 @@ def _point(values: list[float]) -> str:
 
 def _finite_range(values: torch.Tensor) -> str:
     if not values.is_floating_point():
-        return f"{int(values.min())} to {int(values.max())}"
+        integers = values.numpy()  # torch finds no least one of uint64
+        return f"{integers.min()} to {integers.max()}"
     finite = values[values.isfinite()]
     if not finite.numel():
         return "no finite values"

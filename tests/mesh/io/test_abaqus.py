@@ -14,6 +14,7 @@ SECOND = "*Element, elset=skin , type=c3d4h\n2, 2, 3,\n4, 70\n*ELSET, ELSET=othe
 
 def test_sets_types_and_rows_that_go_on(tmp_path):
     shells = "*ELEMENT, TYPE=S3, ELSET=shell\n7, 1,2,3\n*ELEMENT, TYPE=COH3D8\n8, 1,2,3,4,1,2,3,4\n"
+    shells += "*ELEMENT, TYPE=B31\n9, 1,2\n"
     (tmp_path / "a.inp").write_text(
         f"** made by hand\n*HEADING\nBone, of 2 = two parts\n{NODES}{shells}{FIRST}{SECOND}"
     )
@@ -24,6 +25,49 @@ def test_sets_types_and_rows_that_go_on(tmp_path):
         "Of the sets in abaqus:elset, 1 is 'shell', 2 is 'BONE', 3 is 'skin'.",
         "Left out: the sets 'other'.",
     )
+
+
+SQUARE = ((0, 0), (1, 0), (1, 1), (0, 1))
+TOWER = "*NODE\n" + "".join(f"{4 * z + i + 1}, {x}, {y}, {z}\n" for z in range(3) for i, (x, y) in enumerate(SQUARE))
+
+
+@pytest.mark.parametrize(
+    ("kind", "nodes", "volume"),
+    [
+        ("SC8R", "5,6,7,8,9,10,11,12", 1.0),
+        ("CSS8", "5,6,7,8,9,10,11,12", 1.0),
+        ("COH3D8P", "5,6,7,8,9,10,11,12,1,2,3,4", 1.0),
+        ("GK3D8N", "5,6,7,8,9,10,11,12", 1.0),
+        ("SC6RT", "5,6,7,9,10,11", 0.5),
+        ("COH3D6", "5,6,7,9,10,11", 0.5),
+        ("COH3D8", "5,6,7,8,5,6,7,8", 0.0),
+        ("GK3D6L", "5,6,7,9,10,11", None),
+        ("U1", "5,6,7,8,9,10,11,12", None),
+        ("CIN3D8", "5,6,7,8,9,10,11,12", None),
+        ("CPE4R", "5,6,7,8", 0.0),
+    ],
+)
+def test_elements_of_layers_are_read_and_unknown_ones_said(tmp_path, kind, nodes, volume):
+    text = f"{TOWER}*ELEMENT, TYPE=C3D8\n1, 1,2,3,4,5,6,7,8\n*ELEMENT, TYPE={kind}\n2, {nodes}\n"
+    (tmp_path / "a.inp").write_text(text)
+    found = load_data(tmp_path / "a.inp", split=True, flat="refuse")
+    assert float(found.mesh.volumes().sum()) == pytest.approx(1.0 + (volume or 0.0))
+    said = (f"Left out 1 element of type '{kind}', whose shape is not known.",)
+    assert found.warnings == (said if volume is None else ())
+    if volume:
+        (tmp_path / "a.inp").write_text(text.replace(nodes, "5,6,7"))
+        with pytest.raises(MeshError, match=f"type '{kind}' has 3 nodes"):
+            load_data(tmp_path / "a.inp", split=True)
+
+
+def test_keywords_that_go_on_and_numbers_of_fortran(tmp_path):
+    nodes = NODES.replace("1, 0., 0, 0", "1, 0.0D+00, 0.d0, 0").replace("2, 1,", "2, 1.0D+00,")
+    (tmp_path / "a.inp").write_text(
+        f"{nodes.replace('NSET=ALL', '')}*ELEMENT, TYPE=C3D4,\n** a comment\n ELSET=BONE\n1, 1,2,3,4\n"
+        "*ELEMENT,\nTYPE=C3D4,\nELSET=SKIN,\n2, 2,3,4,70\n*STEP,\n"
+    )
+    found = load_data(tmp_path / "a.inp")
+    assert np.allclose(found.mesh.volumes(), [1 / 6, 1 / 3]) and found.cell_data["abaqus:elset"].tolist() == [1, 2]
 
 
 def test_files_that_are_included(tmp_path):

@@ -113,20 +113,33 @@ def test_physical_groups_are_cell_data(tmp_path, version, size, binary):
     assert "several physical groups" in several and "volume 2" in several
 
 
-def test_partitioned_meshes_know_their_groups(tmp_path):
-    writer = Writer("4.1", True, 8)
+@pytest.mark.parametrize("binary", [False, True])
+@pytest.mark.parametrize("version", ["4", "4.1"])
+def test_partitioned_meshes_know_their_groups(tmp_path, version, binary):
+    writer = Writer(version, binary, 8)
     writer.entities({1: [7], 2: []})
-    box = np.zeros(6)
-    parts = [("n", [2, 1]), ("i", [50, 1]), ("n", [1, 0, 0, 2])]
-    parts += [("i", [1, 0, 5]), ("n", 1), ("i", 1), ("d", box[:3]), ("n", 0)]
+    box, few = np.zeros(6), "n" if version == "4.1" else "i"
+    parts = [(few, [2, 1]), ("i", [50, 1]), ("n", [1, 0, 0, 2])]
+    parts += [("i", [1, 0, 5]), (few, 1), ("i", 1), ("d", box[:3] if version == "4.1" else box), ("n", 0)]
     for tag, parent, own in ((11, 1, []), (12, 2, [9])):
-        parts += [("i", [tag, 3, parent]), ("n", 2), ("i", [1, 2]), ("d", box), ("n", len(own)), ("i", own)]
+        parts += [("i", [tag, 3, parent]), (few, 2), ("i", [1, 2]), ("d", box), ("n", len(own)), ("i", own)]
         parts += [("n", 1), ("i", [3])]
     writer.section("PartitionedEntities", *parts)
     writer.mesh(volumes=(11, 12))
     writer.section("GhostElements", ("n", 1), ("n", 8), ("i", 1), ("n", 1), ("i", 2))
     (tmp_path / "a.msh").write_bytes(writer.out)
     assert load_data(tmp_path / "a.msh").cell_data["gmsh:physical"].tolist() == [7, 9]
+
+
+def test_elements_may_have_different_numbers_of_tags(tmp_path):
+    more = "3 4 1 9 2 3 4 5\n4 2 0 1 2 3\n5 4 0 1 2 3 5\n6 15 3 1 2 3 1\n$EndElements"
+    text = HEAD + text_mesh().replace("$Elements\n2", "$Elements\n6").replace("$EndElements", more)
+    (tmp_path / "a.msh").write_text(text)
+    found = load_data(tmp_path / "a.msh", loose=True).cell_data
+    assert found["gmsh:physical"].tolist()[:2] == [7, 7] and sorted(found["gmsh:physical"].tolist())[0] == 0
+    assert set(found) == {"gmsh:physical", "gmsh:geometrical"} and found["gmsh:geometrical"].tolist()[:2] == [1, 1]
+    (tmp_path / "a.msh").write_text(text.replace("4 2 7 1", "4 0").replace("4 1 9", "4 0"))
+    assert load_data(tmp_path / "a.msh", loose=True).cell_data == {}
 
 
 def test_damaged_entities_are_a_sentence(tmp_path):

@@ -135,6 +135,7 @@ def test_only_named_formats_reach_meshio(tmp_path, monkeypatch):
         ("a.foam", "OpenFOAM, .* several files"),
         ("a.e.4.0", "one of several pieces of an Exodus file; join them with epu"),
         ("a.h5", r"give the \.xdmf"),
+        ("a.vtkhdf", r"is VTK's kind of HDF5, and is not read; open it in ParaView and save it as \.vtu"),
     ):
         (tmp_path / name).write_bytes(b"x")
         with pytest.raises(MeshError, match=message):

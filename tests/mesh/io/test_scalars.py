@@ -1,10 +1,11 @@
 """Scalars of a file by name: components, invariants, places, and cells that have no value."""
 
+import numpy as np
 import pytest
 import torch
 
 import difftetvr as dtv
-from difftetvr.mesh.io import MeshData, scalar_of
+from difftetvr.mesh.io import MeshData, load_data, scalar_of
 
 MESH = dtv.TetMesh.grid((2, 2, 2))
 POINTS, CELLS = MESH.num_vertices, MESH.num_cells
@@ -33,7 +34,7 @@ def test_components_and_invariants():
         ("s9:trace", stress.diagonal(dim1=1, dim2=2).sum(1)),
         ("n", torch.arange(CELLS, dtype=torch.float64)),
     ):
-        assert torch.allclose(scalar_of(data, name).values, expected), name
+        assert torch.allclose(scalar_of(data, name).values.double(), expected.double()), name
     deviator = symmetric - symmetric.diagonal(dim1=1, dim2=2).mean(1)[:, None, None] * torch.eye(3)
     mises = (1.5 * deviator.square().sum((1, 2))).sqrt()
     for name in ("s6:von-mises", "s9:von-mises", "s:von-mises"):
@@ -74,3 +75,41 @@ def test_cells_without_a_value_are_taken_out():
     assert found.missing == 1 and 3.0 not in found.values.tolist()
     with pytest.raises(dtv.MeshError, match="finite in no cell"):
         scalar_of(data_of({"p": torch.full((POINTS,), torch.nan)}))
+
+
+@pytest.mark.parametrize("size", [1e-300, 1e-30, 1e19, 3e38, 1e200, 1e307])
+def test_invariants_neither_overflow_nor_underflow(size):
+    dtype = torch.float32 if 1e-40 < size < 1e39 else torch.float64
+    generator = torch.Generator().manual_seed(0)
+    for columns, names in ((3, ["magnitude"]), (6, ["magnitude", "trace", "von-mises"]), (9, ["trace", "von-mises"])):
+        values = torch.rand(POINTS, columns, generator=generator, dtype=torch.float64)
+        values[0] = 0.0
+        for name in names:
+            expected = size * scalar_of(data_of({"a": values}), f"a:{name}").values
+            found = scalar_of(data_of({"a": (size * values).to(dtype)}), f"a:{name}")
+            assert found.missing == 0 and torch.allclose(found.values, expected, rtol=1e-5, atol=0.0)
+
+
+@pytest.mark.parametrize(
+    ("kind", "least"), [("i8", 1_700_000_000_000_000_000), ("i8", -(2**63)), ("u8", 2**63 - 3), ("u8", 2**64 - 2**12)]
+)
+def test_large_integers_lose_their_offset_before_they_are_rounded(kind, least, tmp_path):
+    expected = 3 * np.arange(POINTS)
+    values = np.array([least + n for n in expected.tolist()], kind)
+    np.savez(tmp_path / "a.npz", vertices=MESH.vertices.numpy(), tets=MESH.tets.numpy(), p=values)
+    data = load_data(tmp_path / "a.npz")
+    assert data.point_data["p"].tolist() == values.tolist()
+    found = scalar_of(data)
+    assert found.values.tolist() == expected.tolist() and found.offset == least
+    assert found.counted_from_offset(float(2**60)) == float(2**60 - least)
+    both = scalar_of(data_of({"p": torch.from_numpy(np.stack((values, values[::-1].copy()), 1))}), "p:1")
+    assert both.values.tolist() == expected[::-1].tolist()
+
+
+def test_integers_over_their_whole_range_and_small_ones():
+    ends = torch.full((POINTS,), 2**63 - 1)
+    ends[0] = -(2**63)
+    found = scalar_of(data_of({"p": ends}))
+    assert found.values[0] == 0.0 and found.values[1] == 2.0**64
+    found = scalar_of(data_of({"p": torch.arange(POINTS) + 2**53 - POINTS + 1}))
+    assert found.offset == 0 and found.values[-1] == 2.0**53 and found.counted_from_offset(0.1) == 0.1

@@ -1,5 +1,6 @@
 """VTK's own files, legacy and XML, as VTK writes them."""
 
+import base64
 import itertools
 
 import numpy as np
@@ -121,3 +122,57 @@ def test_structured_legacy_files(tmp_path):
     path.write_text(head.format("STRUCTURED_POINTS").replace("3 2 2", "100 100 100") + tail)
     with pytest.raises(MeshError, match="announces 100 x 100 x 100 points"):
         load_data(path, split=True)
+
+
+@pytest.mark.parametrize("binary", [False, True])
+def test_metadata_of_legacy_files(tmp_path, binary):
+    """Unnamed components have empty lines, and some programs leave one before what follows the names."""
+    vtk = pytest.importorskip("vtk")
+    from vtk.util.numpy_support import numpy_to_vtk
+
+    grid, points = vtk.vtkUnstructuredGrid(), vtk.vtkPoints()
+    positions = numpy_to_vtk(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]]), deep=True)
+    positions.SetComponentName(2, "height")
+    points.SetData(positions)
+    grid.SetPoints(points)
+    grid.InsertNextCell(vtk.VTK_TETRA, 4, [0, 1, 2, 3])
+    expected = {"v": np.arange(12.0).reshape(4, 3), "tc": np.eye(4, 2), "f": np.ones((4, 5)), "s": np.arange(4.0)}
+    add = grid.GetPointData()
+    for name, values in expected.items():
+        array = numpy_to_vtk(values, deep=True)
+        array.SetName(name)
+        array.SetComponentName(min(1, array.GetNumberOfComponents() - 1), "named")
+        array.GetRange(-1)
+        {"v": add.SetVectors, "tc": add.SetTCoords}.get(name, add.AddArray)(array)
+    writer = vtk.vtkUnstructuredGridWriter()
+    writer.SetInputData(grid)
+    writer.SetFileName(str(tmp_path / "a.vtk"))
+    (writer.SetFileTypeToBinary if binary else writer.SetFileTypeToASCII)()
+    writer.Write()
+    content = (tmp_path / "a.vtk").read_bytes()
+    assert content.count(b"COMPONENT_NAMES\n\n") == 4 and content.count(b"INFORMATION") > 3
+    for text in (content, content.replace(b"\nINFORMATION", b"\n\nINFORMATION")):
+        (tmp_path / "a.vtk").write_bytes(text)
+        found = load_data(tmp_path / "a.vtk").point_data
+        assert {name: values.tolist() for name, values in found.items()} == {n: v.tolist() for n, v in expected.items()}
+
+
+def test_identifiers_and_arrays_that_do_not_say_how_they_are_stored(tmp_path):
+    points, cells = np.vstack((np.zeros(3), np.eye(3))), np.arange(4)
+    for dtype in (np.int64, np.int32):
+        arrays = ""
+        for name, kind, values in (
+            ("connectivity", "vtkIdType", cells),
+            ("offsets", "vtkIdType", np.array([4])),
+            ("types", "vtkIdType", np.array([10])),
+        ):
+            data = values.astype("<" + np.dtype(dtype).str[1:]).tobytes()
+            text = base64.b64encode(np.uint32(len(data)).tobytes() + data).decode()
+            arrays += f'<DataArray type="{kind}" Name="{name}" format="binary">{text}</DataArray>'
+        text = " ".join(map(str, points.ravel()))
+        (tmp_path / "a.vtu").write_text(
+            '<VTKFile type="UnstructuredGrid"><UnstructuredGrid><Piece NumberOfPoints="4" NumberOfCells="1">'
+            f'<Points><DataArray type="Float64" NumberOfComponents="3">{text}</DataArray></Points>'
+            f"<Cells>{arrays}</Cells></Piece></UnstructuredGrid></VTKFile>"
+        )
+        assert load_data(tmp_path / "a.vtu").mesh.tets.tolist() == [[0, 1, 2, 3]]

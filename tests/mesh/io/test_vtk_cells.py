@@ -192,3 +192,11 @@ def test_polyhedra_may_be_hidden(tmp_path):
     ghosts = [("vtkGhostType", np.array([32, 0], np.uint8))]
     (tmp_path / "a.vtu").write_text(vtu(piece(POINTS, TETS, [42, 42], cell_data=ghosts, faces=faces)))
     assert load_data(tmp_path / "a.vtu").mesh.vertices.tolist() == POINTS[1:].tolist()
+
+
+def test_meshes_of_hidden_cells_only_say_so(tmp_path):
+    ghosts = [("vtkGhostType", np.array([1, 32], np.uint8))]
+    for copies in (1, 2):
+        (tmp_path / "a.vtu").write_text(vtu(*copies * [piece(POINTS, TETS, [10, 10], cell_data=ghosts)]))
+        with pytest.raises(MeshError, match=rf"All {2 * copies} cells of .* are marked as hidden .*; give the whole"):
+            load_data(tmp_path / "a.vtu")

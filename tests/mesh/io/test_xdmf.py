@@ -6,7 +6,7 @@ import torch
 
 import difftetvr as dtv
 from difftetvr.errors import MeshError
-from difftetvr.mesh.io import load_data
+from difftetvr.mesh.io import load_data, scalar_of
 
 meshio = pytest.importorskip("meshio")
 
@@ -278,3 +278,48 @@ def test_many_references_to_one_large_array_are_refused(write, monkeypatch):
         load_data(path)
     with dtv.trusting(large=True):
         assert len(load_data(path).point_data) == 401
+
+
+def test_symmetric_tensors_are_brought_into_the_order_of_vtk(write):
+    tensors = np.arange(30.0).reshape(5, 6)  # xx xy xz yy yz zz
+    text = attribute("s", tensors).replace("<Attribute", '<Attribute AttributeType="Tensor6"')
+    data = load_data(write(grid(MESH, text, attribute("six", tensors))))
+    assert data.point_data["s"].tolist() == tensors[:, [0, 3, 5, 1, 4, 2]].tolist()
+    assert scalar_of(data, "s:yy").values.tolist() == tensors[:, 3].tolist()
+    assert data.point_data["six"].tolist() == tensors.tolist()
+
+
+@pytest.mark.parametrize("place", ["Topology", "DataItem"])
+def test_indices_that_count_from_one_and_nodes_in_another_order(write, place):
+    order = [3, 0, 2, 1]
+    stored = np.empty_like(TETS)
+    stored[:, order] = TETS + 1
+    text = topology(stored).replace(f"<{place}", f'<{place} BaseOffset="1"')
+    text = text.replace("<Topology", f'<Topology Order="{" ".join(map(str, order))}"')
+    data = load_data(write(grid(text, geometry(), attribute("c", np.arange(2), "Cell"))))
+    assert torch.equal(data.mesh.tets, dtv.TetMesh(POINTS, TETS).tets) and data.cell_data["c"].tolist() == [0, 1]
+    mixed = topology(np.array([6, 1, 2, 3, 4, 6, 2, 3, 4, 5]), "Mixed").replace("<Topology", '<Topology BaseOffset="1"')
+    assert torch.equal(load_data(write(grid(mixed, geometry()))).mesh.tets, data.mesh.tets)
+    for wrong, message in (('Order="0 1 2 2"', "no order of 4 nodes"), ('BaseOffset="-1"', "no index of its first")):
+        with pytest.raises(MeshError, match=message):
+            load_data(write(grid(topology().replace("<Topology", f"<Topology {wrong}"), geometry())))
+
+
+def test_cells_of_other_pieces_are_left_out(write):
+    def piece(shift, flags, points=POINTS):
+        return grid(
+            topology(),
+            geometry(points + np.array([shift, 0, 0])),
+            attribute("vtkGhostType", np.array(flags), "Cell"),
+            attribute("vtkGhostType", np.zeros(5, int)),
+            attribute("c", np.array([shift, shift + 1.0]), "Cell"),
+        )
+
+    data = load_data(write(collection("Spatial", piece(0, [0, 0]), piece(10, [1, 0]), piece(20, [0, 32]))))
+    assert sorted(data.cell_data["c"].tolist()) == [0, 1, 11, 20] and data.point_data == {}
+    assert data.warnings[-1] == "Left out 2 cells marked as hidden or as another piece's (vtkGhostType)."
+    # Of grids with the same points each has what is its own.
+    shared = load_data(write(collection("Spatial", piece(0, [1, 0]), piece(0, [0, 1]))))
+    assert shared.mesh.num_cells == 2 and shared.warnings == ()
+    with pytest.raises(MeshError, match=r"All 2 cells of .* are marked as hidden or as another piece's"):
+        load_data(write(piece(0, [1, 1])))

@@ -90,6 +90,8 @@ def resolve_device(name: str | None) -> torch.device:
         return default_device()
     try:
         device = torch.device(name)
+        if device.type == "cpu" and device.index:
+            raise ValueError  # there is one, but torch takes any number
         torch.empty(1, device=device)
     except Exception as error:  # of any class, and up to kilobytes, for a device that this PyTorch was not built for
         raise FitError(f"The device {shown(name)} cannot be used on this machine; use {devices_here()}.") from error

@@ -20,6 +20,10 @@ Flat = Literal["refuse", "drop", "repair"]
 """What becomes of cells of exactly zero volume."""
 
 
+_LEAST_SINGLE, _MOST_SINGLE = 1e-35, 1e35
+"""Sizes of meshes that can be drawn in single precision."""
+
+
 @dataclass(frozen=True)
 class Request:
     """What is to be loaded, and how; see `difftetvr.load_data`."""
@@ -202,8 +206,11 @@ def _sorted_corners(tets: torch.Tensor, half_faces: torch.Tensor) -> torch.Tenso
 
 
 def _rounded(request: Request, built: Built) -> Built:
-    """In the wanted precision, or in double precision where single would flatten cells and the choice was left open."""
+    """In the wanted precision, or in double precision where single does not do and the choice was left open."""
     mesh = built.mesh
+    if request.dtype is None and not _LEAST_SINGLE < _size(mesh) < _MOST_SINGLE:
+        note = "Kept in double precision, as single precision does not hold products of its size."
+        return replace(built, mesh=mesh.to(dtype=torch.float64), notes=(*built.notes, note))
     if request.dtype == torch.float64:
         return replace(built, mesh=mesh.to(dtype=torch.float64))
     try:
@@ -216,6 +223,11 @@ def _rounded(request: Request, built: Built) -> Built:
             raise MeshError(f"in single precision, {reason}; load with dtype=torch.float64.") from error
         note = "Kept in double precision, as single precision would flatten some of its cells."
         return replace(built, notes=(*built.notes, note))
+
+
+def _size(mesh: TetMesh) -> float:
+    lower, upper = mesh.bounds().double()
+    return float((upper - lower).max())
 
 
 def with_overlaps(built: Built) -> Built:

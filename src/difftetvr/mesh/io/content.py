@@ -40,6 +40,7 @@ class Content:
         point_data: Arrays of V rows.
         cell_data: Arrays of one row for each cell, in the order that `CellBlock.rows` refers to.
         notes: Sentences about what the file holds and the content does not: one for each kind of thing.
+        hidden: Number of volume cells that are not among the cells, as the file says that they are not to be seen.
     """
 
     vertices: np.ndarray
@@ -47,6 +48,7 @@ class Content:
     point_data: dict[str, np.ndarray]
     cell_data: dict[str, np.ndarray]
     notes: tuple[str, ...] = ()
+    hidden: int = 0
 
 
 @dataclass(frozen=True)

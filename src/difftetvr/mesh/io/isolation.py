@@ -108,4 +108,5 @@ def _content(said: dict[str, Any], arrays: Path) -> Content:
         point_data, cell_data = (
             {name: archive[key] for name, key in said[place]} for place in ("point_data", "cell_data")
         )
-        return Content(archive[said["vertices"]], tuple(blocks), point_data, cell_data, tuple(said["notes"]))
+        notes = tuple(said["notes"])
+        return Content(archive[said["vertices"]], tuple(blocks), point_data, cell_data, notes, hidden=said["hidden"])

@@ -73,6 +73,7 @@ def _write(file: Path, content: Content) -> dict[str, Any]:
         "point_data": [[name, key(values)] for name, values in content.point_data.items()],
         "cell_data": [[name, key(values)] for name, values in content.cell_data.items()],
         "notes": list(content.notes),
+        "hidden": content.hidden,
     }
     np.savez(file, **arrays)
     return said

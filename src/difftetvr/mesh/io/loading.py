@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 import torch
 
 from difftetvr.errors import MeshError
+from difftetvr.inputs import require_type
 from difftetvr.mesh.field import Field, Location
 from difftetvr.mesh.io.building import NO_DEFECTS, Defects, Flat, Request, build_mesh, with_overlaps
 from difftetvr.mesh.io.content import Content, require_array
@@ -31,7 +33,7 @@ class MeshData:
         mesh: The mesh of the tetrahedra, without vertices that none of them uses.
         field: Colour and density, where the file has both and they can be rendered; else None.
         point_data: Arrays of one row for each vertex of the mesh: floating-point ones in the precision of the file or
-            of the mesh, whichever is higher, integers and truth values as int64.
+            of the mesh, whichever is higher, integers and truth values as int64, or as uint64 if one is too large.
         cell_data: Arrays of one row for each cell of the mesh; pieces of a cell have its row.
         warnings: Sentences about what was left out or changed.
         defects: What is wrong with the file's cells, as far as they were loaded all the same.
@@ -65,7 +67,7 @@ def load(
         path: .vtu and the other XML files of VTK, .vtk, .msh, .mesh, .xdmf, .npz, .bintet, .ovm, .node or .ele, or
             another that the manual lists.
         dtype: Floating-point type of vertices, colours and densities. Files of this type round-trip to the bit. None:
-            float32, or float64 where rounding to that would flatten or invert a cell.
+            float32, or float64 where rounding to that would flatten or invert a cell, or lose the mesh's size.
         split: Split hexahedra, wedges, pyramids and polyhedra into tetrahedra, and straighten cells of higher order.
         flat: What becomes of cells of exactly zero volume: "drop" leaves them out, which changes no picture; "repair"
             mends the mesh so that it can be deformed, too (see `difftetvr.mesh.making.repair`); "refuse" makes them an
@@ -84,7 +86,7 @@ def load_with_optional_field(
     path: str | Path, dtype: torch.dtype | None = None, *, split: bool = False, flat: Flat = "refuse"
 ) -> tuple[TetMesh, Field | None]:
     """Like `load`, but gives None for the field of a file that holds no ``color`` and ``density``."""
-    data, problem = _load(Request(Path(path), dtype, split, flat))
+    data, problem = _load(Request(_path(path), dtype, split, flat))
     if problem is not None:
         raise problem
     return data.mesh, data.field
@@ -98,7 +100,7 @@ def load_mesh(
     Raises:
         MeshError: As `load`, except that no data arrays are needed.
     """
-    return _load(Request(Path(path), dtype, split, flat))[0].mesh
+    return _load(Request(_path(path), dtype, split, flat))[0].mesh
 
 
 def load_data(
@@ -132,7 +134,7 @@ def load_data(
     Raises:
         MeshError: As `load`.
     """
-    request = Request(Path(path), dtype, split, flat, step, loose)
+    request = Request(_path(path), dtype, split, flat, step, loose)
     data, problem = _load(request)
     if require_field:
         if problem is not None:
@@ -147,6 +149,11 @@ def load_data(
     elif problem is not None:
         return replace(data, warnings=(*data.warnings, str(problem)))
     return data
+
+
+def _path(path: str | Path) -> Path:
+    require_type(path, (str, os.PathLike), "The mesh file", "pass its path", MeshError)
+    return Path(path)
 
 
 def _load(request: Request) -> tuple[MeshData, MeshError | None]:
@@ -195,10 +202,11 @@ def _tensor(values: np.ndarray, rows: np.ndarray, dtype: torch.dtype | None) -> 
     if values.dtype.kind not in "fiub" or values.ndim == 0 or values.size == 0 or len(values) <= rows.max():
         return None
     picked = values[rows]
-    if picked.dtype.kind == "f" or (picked.dtype.itemsize == 8 and (picked > _LARGEST_INTEGER).any()):
+    if picked.dtype.kind == "f":
         found = _floats(picked)
         return found.to(dtype) if dtype == torch.float64 else found
-    return torch.from_numpy(picked.astype(np.int64))
+    is_too_large = picked.dtype.kind == "u" and (picked > _LARGEST_INTEGER).any()
+    return torch.from_numpy(picked.astype(np.uint64 if is_too_large else np.int64))
 
 
 def _picked(path: Path, arrays: dict[str, np.ndarray], name: str, rows: np.ndarray) -> np.ndarray:

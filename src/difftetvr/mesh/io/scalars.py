@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from fractions import Fraction
 
+import numpy as np
 import torch
 
 from difftetvr.errors import MeshError, counted
@@ -21,6 +24,9 @@ _FULL = tuple(a + b for a in _VECTOR for b in _VECTOR)
 _AXES = {3: _VECTOR, 6: _SYMMETRIC, 9: _FULL}
 """Names of components by their number, in VTK's order."""
 
+_LARGEST_EXACT = 2**53
+"""Up to here float64 holds every integer."""
+
 
 @dataclass(frozen=True)
 class Scalar:
@@ -29,9 +35,11 @@ class Scalar:
     Attributes:
         name: What it is called, with its component: ``T``, ``velocity:x``, ``magnitude of velocity``.
         mesh: The mesh; without the cells that have no value.
-        values: (V,) or (T,) finite numbers, in the precision of the file.
+        values: (V,) or (T,) finite numbers, components in the precision of the file, else float64.
         location: Where they live.
         missing: Number of cells that were left out, as a number of theirs is not finite.
+        offset: What was taken off the values: the least of integers that float64 does not hold, such as times in
+            nanoseconds; else 0.
     """
 
     name: str
@@ -39,6 +47,11 @@ class Scalar:
     values: torch.Tensor
     location: Location
     missing: int = 0
+    offset: int = 0
+
+    def counted_from_offset(self, value: float) -> float:
+        """A number of the file's as `values` have it, without rounding in between."""
+        return float(Fraction(value) - self.offset) if math.isfinite(value) else value
 
 
 def scalar_of(data: MeshData, name: str | None = None) -> Scalar:
@@ -69,7 +82,8 @@ def scalar_of(data: MeshData, name: str | None = None) -> Scalar:
     else:
         place, base, component = _parsed(name, found, names)
     values, label = _component(found[place, base], base, component)
-    return _without_missing(Scalar(label, data.mesh, values, place))
+    numbers, offset = _numbers(values)
+    return _without_missing(Scalar(label, data.mesh, numbers, place, offset=offset))
 
 
 def _candidates(data: MeshData) -> dict[tuple[Location, str], torch.Tensor]:
@@ -108,13 +122,12 @@ def _parsed(name: str, found: dict[tuple[Location, str], torch.Tensor], names: s
 
 def _component(values: torch.Tensor, base: str, component: str | None) -> tuple[torch.Tensor, str]:
     """(N,) numbers of a component, and what to call it."""
-    values = values if values.is_floating_point() else values.double()
     columns = values[:, None] if values.dim() == 1 else values
     count = columns.shape[1]
     if component is None:
         if count == 1:
             return columns[:, 0], base
-        return _length(columns), f"magnitude of {base}"
+        return _invariant(_length, columns), f"magnitude of {base}"
     axes = _AXES.get(count, ())
     if component.isascii() and component.isdigit() and int(component) < count:
         return columns[:, int(component)], f"{base}:{component}"
@@ -124,9 +137,30 @@ def _component(values: torch.Tensor, base: str, component: str | None) -> tuple[
     if count in (6, 9):
         invariants |= {"trace": _trace, "von-mises": _von_mises}
     if component in invariants:
-        return invariants[component](columns), f"{component} of {base}"
+        return _invariant(invariants[component], columns), f"{component} of {base}"
     known = ", ".join((f"0 to {count - 1}" if count > 1 else "0", *axes, *invariants))
     raise MeshError(f"'{base}' has no component '{component}'; its components are {known}.")
+
+
+def _numbers(values: torch.Tensor) -> tuple[torch.Tensor, int]:
+    """Floating-point numbers, and what was taken off them: the least of integers that float64 would round."""
+    if values.is_floating_point():
+        return values, 0
+    integers = values.numpy()
+    least, greatest = int(integers.min()), int(integers.max())
+    if max(-least, greatest) <= _LARGEST_EXACT:
+        return values.double(), 0
+    # Modulo 2^64, in which no difference overflows.
+    above = integers.astype(np.uint64) - np.uint64(least % 2**64)
+    return torch.from_numpy(above.astype(np.float64)), least
+
+
+def _invariant(of_tensors: Callable[[torch.Tensor], torch.Tensor], columns: torch.Tensor) -> torch.Tensor:
+    """(N,) float64 numbers that grow as their tensors do, of which no square overflows or underflows."""
+    exact = columns.double()
+    largest = exact.abs().amax(1)
+    size = torch.where(largest > 0, largest, 1.0)
+    return size * of_tensors(exact / size[:, None])
 
 
 def _length(columns: torch.Tensor) -> torch.Tensor:

@@ -29,6 +29,11 @@ def tetrahedra_of(request: Request, content: Content) -> Tets:
     """
     path, split = request.path, request.split
     volumes = [b for b in content.cells if len(b.nodes) and not b.kind.startswith(_LOWER_DIMENSIONAL)]
+    if not volumes and content.hidden:
+        raise MeshError(
+            f"All {counted(content.hidden, 'cell')} of {path} are marked as hidden or as another piece's; give the "
+            "whole mesh, or another time step."
+        )
     if not volumes:
         found = ", ".join(sorted({block.kind for block in content.cells})) or "no cells"
         raise MeshError(f"{path} holds no tetrahedra (found: {found}); give a tetrahedral volume mesh.")

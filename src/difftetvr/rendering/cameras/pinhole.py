@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 _ORTHONORMALITY_TOLERANCE = 1e-3
 _FAR = 16.0  # distances of camera and target from the origin, in their distance from each other
+_LEAST_SINGLE, _MOST_SINGLE = 1e-30, 1e30  # distances that float32 holds with all digits, and sums of them
 _MOST_PIXELS = 1 << 28  # four floats a pixel stay within the kernels' 32-bit indices
 
 Vector = Sequence[float] | torch.Tensor
@@ -102,7 +103,7 @@ class Camera:
 
         Returns:
             The camera; its extrinsics are float64 if it is so far from the origin that float32 would not tell where it
-            is, and else float32.
+            is, or distances are too large or too small for float32, and else float32.
 
         Raises:
             CameraError: The points coincide, ``up`` is parallel to the view, or a value is out of range.
@@ -129,7 +130,8 @@ class Camera:
         pose[:3, :3] = rotation
         pose[:3, 3] = -rotation @ origin
         ends = torch.stack((origin, center)).detach()
-        if float(ends.abs().max()) < _FAR * float((ends[1] - ends[0]).norm()):
+        farthest = float(ends.abs().max())
+        if _LEAST_SINGLE < farthest < min(_FAR * float((ends[1] - ends[0]).norm()), _MOST_SINGLE):
             pose = pose.to(torch.float32)
         focal = 0.5 * height / math.tan(0.5 * fov_y)
         return Camera(pose, focal, focal, 0.5 * width, 0.5 * height, width, height)

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from difftetvr.errors import MeshError
+from difftetvr.errors import MeshError, counted, listed
 from difftetvr.mesh.io.content import CellBlock, Content, damaged
+from difftetvr.mesh.making.conversion import num_nodes
 from difftetvr.trust import file_beside, require_regular
 
 _VOLUMES = {
@@ -26,7 +27,16 @@ _VOLUMES = {
 }
 _SURFACES = {3: "triangle", 4: "quad", 6: "triangle6", 8: "quad8", 9: "quad9"}
 _SOLID = re.compile(r"(?:AC|C|DC|DCC|EC|FC|Q)3D(\d+)")
-_SHELL = re.compile(r"(?:DS|M3D|R3D|S|SC|SFM3D|STRI)(\d+)")
+_LAYER = re.compile(r"(?:COH3D|CSS|GK3D|SC)([68])(?![\dL])")
+"""Cohesive and gasket elements, continuum and solid shells: wedges and hexahedra, maybe with further nodes behind."""
+
+_SHELL = re.compile(r"(?:DS|M3D|R3D|S|SFM3D|STRI)(\d+)")
+_BESIDE = re.compile(
+    r"AC2D|ACAX|ASI|B\d|C?AX|CGAX|COH2D|COHAX|CONN|CPE|CPS|DASHPOT|DC2D|DCAX|DS|ELBOW|F2D|F3D|FAX|FRAME|GAP|GK2D|GKAX|"
+    r"GKP|HEATCAP|ITS|ITT|JOINT|M3D|MASS|MAX|MCL|MGAX|PIPE|R2D|R3D|RAX|RB|ROTARYI|S\d|SAX|SF|SPRING|STRI|T2D|T3D|W"
+)
+"""What has no volume: shells, membranes, beams, links, masses, and elements of the plane."""
+
 _GENERATE = ("ELCOPY", "ELGEN", "NCOPY", "NFILL", "NGEN", "NMAP", "SYSTEM")
 _DEEPEST, _MOST_FILES, _MOST_NAMES = 16, 1000, 12
 
@@ -83,9 +93,7 @@ def _lines(path: Path) -> Iterator[str]:
             raise damaged(path, "its files include each other without end")
         require_regular(file, MeshError)
         with open(file, encoding="utf-8", errors="replace") as text:
-            for line in map(str.strip, text):
-                if not line or line.startswith("**"):
-                    continue
+            for line in _whole_lines(text):
                 keyword, options = _keyword(line) if line.startswith("*") else ("", {})
                 if keyword != "INCLUDE":
                     yield line
@@ -93,6 +101,23 @@ def _lines(path: Path) -> Iterator[str]:
                     yield from lines_of(_named(path, file, options["INPUT"]), depth + 1)
 
     return lines_of(path, 0)
+
+
+def _whole_lines(text: Iterable[str]) -> Iterator[str]:
+    """Lines of one file, those of keywords with the options that follow a comma at their end."""
+    begun = ""
+    for line in map(str.strip, text):
+        if not line or line.startswith("**"):
+            continue
+        if begun and line[0].isalpha():
+            line = begun + line
+        elif begun:
+            yield begun
+        begun = line if line.startswith("*") and line.endswith(",") else ""
+        if not begun:
+            yield line
+    if begun:
+        yield begun
 
 
 def _keyword(line: str) -> tuple[str, dict[str, str]]:
@@ -145,8 +170,9 @@ def _whole(path: Path, word: str) -> int:
 
 
 def _numbers(path: Path, row: str) -> list[float]:
+    words = row.rstrip(",").upper().replace("D", "E").split(",")  # Fortran writes 1.0D+00
     try:
-        return [float(word) if word.strip() else 0.0 for word in row.rstrip(",").split(",")]
+        return [float(word) if word.strip() else 0.0 for word in words]
     except ValueError as error:
         raise damaged(path, f"{row[:40]!r} stands where numbers should be") from error
 
@@ -173,17 +199,23 @@ def _content(path: Path, state: _State) -> Content:
         raise damaged(path, "it lacks its nodes")
     sets = [name for name in dict.fromkeys(name for _, name in state.elements) if name]
     parts: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
-    numbers, begin = [np.empty(0, np.int64)], 0
+    points, numbers, begin = np.array(state.points), [np.empty(0, np.int64)], 0
     for (kind, name), elements in state.elements.items():
         sizes = {len(nodes) for nodes in elements}
         if len(sizes) > 1:
             raise damaged(path, f"the elements of type {kind[:20]!r} have different numbers of nodes")
         if not elements:
             continue
-        rows = np.arange(begin, begin + len(elements))
-        parts.setdefault(_name(path, kind, sizes.pop()), []).append((np.array(elements, np.int64), rows))
-        numbers.append(np.full(len(rows), sets.index(name) + 1 if name else 0))
-        begin += len(rows)
+        rows, nodes = np.arange(begin, begin + len(elements)), np.array(elements, np.int64)
+        shape = _name(path, kind, sizes.pop())
+        if _LAYER.match(kind):
+            nodes = nodes[:, : num_nodes(shape)]
+            is_glue = _are_thin(points[nodes])
+            parts.setdefault("polygon", []).append((nodes[is_glue], rows[is_glue]))
+            nodes, rows = nodes[~is_glue], rows[~is_glue]
+        parts.setdefault(shape, []).append((nodes, rows))
+        numbers.append(np.full(len(elements), sets.index(name) + 1 if name else 0))
+        begin += len(elements)
     blocks = []
     for kind, found in parts.items():
         of_all = np.concatenate([part[1] for part in found])
@@ -191,21 +223,41 @@ def _content(path: Path, state: _State) -> Content:
         table = np.concatenate([nodes for nodes, _ in found]) if is_table else np.empty((len(of_all), 0), np.int64)
         blocks.append(CellBlock(kind, table, of_all))
     cell_data = {"abaqus:elset": np.concatenate(numbers)} if sets else {}
-    return Content(np.array(state.points), tuple(blocks), {}, cell_data, _notes(state, sets))
+    return Content(points, tuple(blocks), {}, cell_data, _notes(state, sets))
+
+
+def _are_thin(corners: np.ndarray) -> np.ndarray:
+    """(N,) which layers (N, n, 3) have their upper face where their lower one is, as glue between bodies has."""
+    lower, upper = np.split(corners, 2, axis=1)
+    return (lower == upper).all((1, 2))
 
 
 def _name(path: Path, kind: str, size: int) -> str:
     """Name of the kind of an element type; "polygon" for all that has no volume."""
-    solid, shell = _SOLID.match(kind), _SHELL.match(kind)
-    if solid is None:
-        return _SURFACES.get(size, "polygon") if shell else "polygon"
-    if int(solid.group(1)) != size:
+    solid, layer = _SOLID.match(kind), _LAYER.match(kind)
+    if solid is None and layer is None:
+        return _SURFACES.get(size, "polygon") if _SHELL.match(kind) else "polygon"
+    if (solid and int(solid.group(1)) != size) or (layer and int(layer.group(1)) > size):
         raise damaged(path, f"an element of type {kind[:20]!r} has {size} nodes")
-    return _VOLUMES.get(size, kind[:20])
+    return _VOLUMES[int(layer.group(1))] if layer else _VOLUMES.get(size, kind[:20])
+
+
+def _unknown(state: _State) -> dict[str, int]:
+    """Numbers of elements that may have a volume, but of no shape that is known, by their type."""
+    counts: dict[str, int] = {}
+    for (kind, _), elements in state.elements.items():
+        is_known = any(pattern.match(kind) for pattern in (_SOLID, _LAYER, _BESIDE))
+        if not is_known and elements and len(elements[0]) >= 4:
+            counts[kind] = counts.get(kind, 0) + len(elements)
+    return counts
 
 
 def _notes(state: _State, sets: list[str]) -> tuple[str, ...]:
     notes = []
+    if unknown := _unknown(state):
+        words = [f"{counted(number, 'element')} of type {kind[:20]!r}" for kind, number in unknown.items()]
+        more = [f"{len(words) - _MOST_NAMES} other types"] if len(words) > _MOST_NAMES else []
+        notes.append(f"Left out {listed([*words[:_MOST_NAMES], *more])}, whose shape is not known.")
     if sets:
         said = ", ".join(f"{i + 1} is {name[:40]!r}" for i, name in enumerate(sets[:_MOST_NAMES]))
         notes.append(f"Of the sets in abaqus:elset, {said}{', ...' if len(sets) > _MOST_NAMES else ''}.")

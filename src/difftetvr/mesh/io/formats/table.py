@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from difftetvr.errors import MeshError
+from difftetvr.errors import MeshError, shown
 from difftetvr.mesh.io.content import Content, Output
 from difftetvr.mesh.io.formats import abaqus, bintet, exodus, medit, npz, ovm, tetgen, through_meshio, unsupported
 from difftetvr.mesh.io.formats.gmsh import reading as gmsh_reading
-from difftetvr.mesh.io.formats.vtk import legacy, lists
+from difftetvr.mesh.io.formats.vtk import legacy, lists, series
 from difftetvr.mesh.io.formats.xdmf import reading as xdmf_reading
 from difftetvr.mesh.io.formats.xdmf import writing as xdmf_writing
 from difftetvr.trust import require_regular
+
+_LONGEST_SHOWN = 400
 
 
 @dataclass(frozen=True)
@@ -79,11 +82,13 @@ def read_content(path: Path, step: int | None = None) -> Content:
     Raises:
         MeshError: There is no such file, or it cannot be read.
     """
-    if path.is_dir():
+    if os.path.isdir(path):
         raise MeshError(f"{path} is a folder; give the mesh file in it.")
     require_regular(path, MeshError)
-    if not path.is_file():
-        raise MeshError(f"There is no mesh file {path}; check the path.")
+    # Not Path.is_file, which raises where a name is too long.
+    if not os.path.isfile(path):
+        name = str(path) if len(str(path)) <= _LONGEST_SHOWN else shown(str(path))
+        raise MeshError(f"There is no mesh file {name}; check the path.")
     try:
         return format_of(path).content(path, step)
     except OSError as error:
@@ -112,5 +117,6 @@ FORMATS: dict[str, Format] = {
     ".inp": Format(abaqus.read),
     ".mesh": Format(medit.read, through_meshio.write, holds_field=False),
     **dict.fromkeys(_VTK_XML, Format(lists.read, has_steps=True)),
+    ".series": Format(series.read, has_steps=True),
 }
 """Formats by suffix; those that are written are offered in this order."""

@@ -22,6 +22,7 @@ _PARTS = {
     ".pos": ("data of Gmsh without its mesh", "save both as .msh: gmsh -save -format msh41"),
     ".h5": ("HDF5, in which every program keeps its arrays elsewhere", "give the .xdmf that belongs to it"),
     ".hdf5": ("HDF5, in which every program keeps its arrays elsewhere", "give the .xdmf that belongs to it"),
+    ".vtkhdf": ("VTK's kind of HDF5", _CONVERT),
     ".plt": ("a binary result of Tecplot", "save it as .vtu or as text (.tec)"),
     ".cas": ("a case of ANSYS Fluent, whose data lie in a .dat beside it", _CONVERT),
     ".rst": ("a binary result of ANSYS", "convert it to .vtu with pymapdl-reader"),

@@ -74,18 +74,21 @@ def read_entities(source: Source, groups: Groups, data_size: int | None) -> None
                 _list(source, size_type)  # what bounds it
 
 
-def read_partitioned_entities(source: Source, groups: Groups, data_size: int) -> None:
-    """The section PartitionedEntities of format 4.1, whose entities elements are in where a mesh was partitioned."""
-    size_type = f"u{data_size}"
-    source.numbers(1, size_type, "the number of partitions")
-    ghosts = int(source.numbers(1, size_type, "the number of ghost entities")[0])
+def read_partitioned_entities(source: Source, groups: Groups, data_size: int | None) -> None:
+    """The section PartitionedEntities, whose entities elements are in where a mesh was partitioned.
+
+    Of format 4.1, or of 4.0 where the size of numbers is None, whose numbers of partitions are of 4 bytes.
+    """
+    size_type, few_type = f"u{data_size or 8}", f"u{data_size or 4}"
+    source.numbers(1, few_type, "the number of partitions")
+    ghosts = int(source.numbers(1, few_type, "the number of ghost entities")[0])
     source.numbers(2 * ghosts, "i4", "ghost entities")
     counts = source.numbers(4, size_type, "numbers of partitioned entities").tolist()
     for dimension, count in enumerate(counts):
         for _ in range(_possible(source, count)):
             tag, parent_dimension, parent = source.numbers(3, "i4", "partitioned entities").tolist()
-            _list(source, size_type)  # its partitions
-            source.numbers(6 if dimension else 3, "f8", "partitioned entities")
+            _list(source, few_type)  # its partitions
+            source.numbers(3 if dimension == 0 and data_size is not None else 6, "f8", "partitioned entities")
             own = _list(source, size_type)
             groups.physical[dimension, tag] = own or groups.physical.get((parent_dimension, parent), [])
             if dimension:

@@ -124,7 +124,7 @@ def _read_section(source: Source, state: _State, name: str, form: _Format) -> No
         read_names(source, state.groups)
     elif name == "Entities" and form.version != "2":
         read_entities(source, state.groups, size)
-    elif name == "PartitionedEntities" and size is not None:
+    elif name == "PartitionedEntities" and form.version != "2":
         read_partitioned_entities(source, state.groups, size)
     elif name in PLACES:
         state.views.read(source, name)
@@ -182,14 +182,15 @@ def _only_mesh(source: Source, state: _State) -> _Mesh:
 def _groups(groups: Groups, elements: list[Elements], form: _Format) -> tuple[dict[str, np.ndarray], list[str]]:
     """Cell data of groups, and sentences about them.
 
-    In format 2 these are what all elements name; in format 4 they follow from the elements' entities.
+    In format 2 these are what elements name, each as many as it likes; in format 4 they follow from the entities.
     """
-    columns = {e.groups.shape[1] for e in elements}
-    if len(columns) != 1 or columns == {0}:
+    are_volumes = [e.kind.startswith(("tetra", "hexahedron", "wedge", "pyramid")) for e in elements]
+    columns = max((e.groups.shape[1] for e, is_volume in zip(elements, are_volumes) if is_volume), default=0)
+    if not columns:
         return {}, []
-    table = np.concatenate([e.groups for e in elements])
-    volumes = [e.groups for e in elements if e.kind.startswith(("tetra", "hexahedron", "wedge", "pyramid"))]
-    inner = np.concatenate([table[:0], *volumes])
+    tables = [np.pad(e.groups[:, :columns], ((0, 0), (0, max(columns - e.groups.shape[1], 0)))) for e in elements]
+    table = np.concatenate(tables)
+    inner = np.concatenate([part for part, is_volume in zip(tables, are_volumes) if is_volume])
     if form.version == "2":
         names = ("gmsh:physical", "gmsh:geometrical")[: table.shape[1]]
         found = {name: table[:, i] for i, name in enumerate(names)}

@@ -12,7 +12,9 @@ from difftetvr.errors import counted
 from difftetvr.mesh.io.content import Content
 from difftetvr.mesh.io.formats.vtk.cells import Cells, blocks
 
-_GHOSTS, _OLD_GHOSTS = "vtkGhostType", "vtkGhostLevels"
+GHOSTS = (_GHOSTS, _OLD_GHOSTS) = ("vtkGhostType", "vtkGhostLevels")
+"""Names of the arrays that say which cells are not to be seen."""
+
 _DUPLICATE_POINT, _HIDDEN_POINT = 1, 2
 _UNSEEN_CELL = 1 | 8 | 32
 """Bits of cells that another piece has, that finer ones stand for, and that are hidden; see vtkDataSetAttributes.h."""
@@ -49,36 +51,40 @@ class Grid:
             MeshError: A cell has not as many vertices as cells of its kind.
         """
         found, more = blocks(path, self.cells, self.points)
-        hidden = (
-            (f"Left out {counted(self.hidden, 'cell')} marked as hidden or as another piece's ({_GHOSTS}).",)
-            if self.hidden
-            else ()
-        )
-        return Content(self.points, found, self.point_data, self.cell_data, (*notes, *hidden, *more))
+        notes = (*notes, *hidden_notes(self.hidden), *more)
+        return Content(self.points, found, self.point_data, self.cell_data, notes, hidden=self.hidden)
 
 
 def visible_grid(
     points: np.ndarray, cells: Cells, point_data: dict[str, np.ndarray], cell_data: dict[str, np.ndarray]
 ) -> Grid:
     """A data set less the cells that its ghost arrays mark as hidden or as duplicates, and less these arrays."""
-    of_points, of_cells = _mark(point_data, _GHOSTS), _mark(cell_data, _GHOSTS)
-    unseen = np.zeros(len(cells.types), bool)
-    if of_cells is not None:
-        unseen |= (of_cells & _UNSEEN_CELL) != 0
-    if (levels := _mark(cell_data, _OLD_GHOSTS)) is not None:
-        unseen |= levels > 0
+    of_points, unseen = _mark(point_data, _GHOSTS), np.zeros(len(cells.types), bool)
+    for name in GHOSTS:
+        if (marks := _mark(cell_data, name)) is not None:
+            unseen |= are_unseen(name, marks)
     are_duplicates = np.zeros(len(points), bool)
     if of_points is not None:
         are_duplicates |= (of_points & _DUPLICATE_POINT) != 0
         unseen |= _have_node(cells, (of_points & _HIDDEN_POINT) != 0)
     if (levels := _mark(point_data, _OLD_GHOSTS)) is not None:
         are_duplicates |= levels > 0
-    ghosts = (_GHOSTS, _OLD_GHOSTS)
-    point_data = {name: values for name, values in point_data.items() if name not in ghosts}
-    cell_data = {name: values for name, values in cell_data.items() if name not in ghosts}
+    point_data = {name: values for name, values in point_data.items() if name not in GHOSTS}
+    cell_data = {name: values for name, values in cell_data.items() if name not in GHOSTS}
     count = int((unseen & cells.have_volume).sum())
     cells = cells.without(unseen) if unseen.any() else cells
     return Grid(points, cells, point_data, cell_data, are_duplicates, count)
+
+
+def are_unseen(name: str, marks: np.ndarray) -> np.ndarray:
+    """(N,) which cells are not to be seen, by the integers of the array of that name."""
+    return (marks & _UNSEEN_CELL) != 0 if name == _GHOSTS else marks > 0
+
+
+def hidden_notes(count: int) -> tuple[str, ...]:
+    """What is to be said of so many cells that are not to be seen."""
+    what = f"{counted(count, 'cell')} marked as hidden or as another piece's ({_GHOSTS})"
+    return (f"Left out {what}.",) if count else ()
 
 
 def used_points(grid: Grid) -> np.ndarray:

@@ -42,6 +42,7 @@ _TYPES = {
     "vtktypefloat64": "f8",
 }
 _TEXTS = ("string", "utf8_string", "variant")
+_STRUCTURE = ("dimensions", "origin", "spacing", "aspect_ratio", "x_coordinates", "y_coordinates", "z_coordinates")
 _ATTRIBUTES = {"vectors": 3, "normals": 3, "tensors": 9, "tensors6": 6, "global_ids": 1, "pedigree_ids": 1}
 
 
@@ -61,6 +62,7 @@ class _State:
         cell_data: Arrays by name.
         active: The arrays that attributes go to, and the length they have.
         texts: Names of data that are no numbers.
+        columns: Number of components of the last array, each of which metadata give a name.
     """
 
     kind: str = ""
@@ -74,6 +76,7 @@ class _State:
     cell_data: dict[str, np.ndarray] = field(default_factory=dict)
     active: tuple[dict[str, np.ndarray], int] | None = None
     texts: set[str] = field(default_factory=set)
+    columns: int = 1
 
 
 def read(path: Path) -> Content:
@@ -112,6 +115,7 @@ def _read_section(source: Source, state: _State, words: list[str]) -> None:
     elif keyword == "points":
         count = source.count(words[1], "points")
         state.vertices = _array(source, 3 * count, words[2], "points").reshape(count, 3)
+        state.columns = 3
     elif keyword == "cells":
         _read_cells(source, state, words)
     elif keyword == "cell_types":
@@ -120,10 +124,10 @@ def _read_section(source: Source, state: _State, words: list[str]) -> None:
         count = source.count(words[1], "values")
         state.active = (state.point_data if keyword == "point_data" else state.cell_data, count)
     elif keyword == "metadata":
-        _skip_metadata(source)
+        _skip_metadata(source, state)
     elif keyword == "field":
         _read_field(source, state, source.count(words[2], "arrays"))
-    elif keyword in ("dimensions", "origin", "spacing", "aspect_ratio") or keyword.endswith("_coordinates"):
+    elif keyword in _STRUCTURE:
         _read_structure(source, state, keyword, words)
     else:
         _read_attribute(source, state, keyword, words)
@@ -148,6 +152,7 @@ def _read_structure(source: Source, state: _State, keyword: str, words: list[str
         state.shape = tuple(source.count(word, "points along an axis") for word in words[1:4])
     elif axis in ("x", "y", "z"):
         state.axes[axis] = _array(source, source.count(words[1], "coordinates"), words[2], "coordinates")
+        state.columns = 1
     else:
         try:
             state.axes[keyword] = np.array([float(word) for word in words[1:4]])
@@ -175,17 +180,19 @@ def _read_attribute(source: Source, state: _State, keyword: str, words: list[str
         raise source.damaged(f"it has an unknown section {keyword[:40]!r}")
     values = _array(source, count * columns, kind, f"values of {words[1]}")
     arrays[unquote(words[1])] = values.reshape(count, columns) if columns > 1 else values
+    state.columns = columns
 
 
 def _read_field(source: Source, state: _State, count: int) -> None:
     for _ in range(count):
         words = source.words("an array", 1)
         if words[0].lower() == "metadata":
-            _skip_metadata(source)
+            _skip_metadata(source, state)
             words = source.words("an array", 1)
         if len(words) != 4:
             raise source.damaged(f"{words[0][:40]!r} does not begin an array")
         columns, rows = source.count(words[1], "components"), source.count(words[2], "values")
+        state.columns = columns
         # A field before the first data section belongs to the file as a whole, such as its time.
         is_data = state.active is not None and rows == state.active[1]
         if words[3].lower() in _TEXTS:
@@ -210,9 +217,17 @@ def _skip_texts(source: Source, count: int, kind: str) -> None:
         source.take(int.from_bytes(bytes([first & 63]) + rest, "big"), "texts")
 
 
-def _skip_metadata(source: Source) -> None:
-    while source.line():
-        pass
+def _skip_metadata(source: Source, state: _State) -> None:
+    """Pass over lines up to an empty one; those of components' names, which may be empty, are as many as these."""
+    while (line := source.line()) is not None:
+        if line.upper() == "COMPONENT_NAMES":
+            for _ in range(state.columns):
+                source.line()
+        elif not line:
+            start = source.position()
+            if not (source.next_line() or "").upper().startswith("INFORMATION "):
+                source.seek(start)
+                return
 
 
 def _skip_table_name(source: Source) -> None:

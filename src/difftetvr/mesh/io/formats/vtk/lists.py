@@ -47,11 +47,12 @@ class _Reader:
 
     def __init__(self, path: Path) -> None:
         self.grids: list[Grid] = []
-        self._path = path
         self._notes: dict[str, None] = {}
         self._texts: set[str] = set()
         self._surfaces = 0
-        self._seen: set[Path] = set()
+        # Not Path.resolve, which raises where links lead in a circle.
+        self._open = [os.path.realpath(path)]
+        self._seen: set[str] = set()
 
     def notes(self) -> list[str]:
         """What is to be said of all files together."""
@@ -89,20 +90,25 @@ class _Reader:
             raise document.damaged("files name each other without end")
         for element in elements:
             file = file_beside(document.path, element.get(key, ""), MeshError)
-            # Not Path.resolve and Path.is_file, which raise where links lead in a circle.
-            target = Path(os.path.realpath(file))
-            if target in self._seen or target == Path(os.path.realpath(self._path)):
-                raise document.damaged(f"{file.name} is named twice among its pieces")
-            self._seen.add(target)
+            target = os.path.realpath(file)
+            if target in self._open:
+                raise document.damaged(f"{file.name} is named by itself, or by what it names")
+            if target in self._seen:
+                self._notes[f"{file.name} is named several times, and was read once."] = None
+                continue
             if not os.path.isfile(file):
                 raise MeshError(f"{document.path} names {file.name}, which is not there; put it where it was.")
+            self._seen.add(target)
+            self._open.append(target)
             self.read(file, step, depth + 1)
+            self._open.pop()
 
     def _chosen(self, document: Document, step: int | None) -> list[Element]:
         """The files of one time step."""
         by_time: dict[float, list[Element]] = {}
         for element in document.root.iter("DataSet"):
-            (time,) = document.numbers(element, "timestep", 1, "0")
+            has_time = element.get("timestep", "").strip() != ""
+            time = document.numbers(element, "timestep", 1, "")[0] if has_time else 0.0
             by_time.setdefault(time, []).append(element)
         if not by_time:
             raise MeshError(f"{document.path} names no files; write it again.")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -33,9 +34,10 @@ def merged(path: Path, grids: Sequence[Grid]) -> tuple[Grid, tuple[str, ...]]:
     Raises:
         MeshError: A cell has a vertex that its piece has not.
     """
+    hidden = sum(grid.hidden for grid in grids)
     grids = [grid for grid in grids if grid.cells.have_volume.any()] or list(grids[:1])
     if len(grids) == 1:
-        return grids[0], ()
+        return replace(grids[0], hidden=hidden), ()
     for grid in grids:
         _require_in_range(path, grid)
     points = np.concatenate([grid.points for grid in grids])
@@ -45,7 +47,7 @@ def merged(path: Path, grids: Sequence[Grid]) -> tuple[Grid, tuple[str, ...]]:
     point_data, partial = _common_data([grid.point_data for grid in grids])
     cell_data, partial_too = _common_data([grid.cell_data for grid in grids])
     cells = _joined_cells(grids, place)
-    whole = Grid(points, cells, point_data, cell_data, spare, sum(grid.hidden for grid in grids))
+    whole = Grid(points, cells, point_data, cell_data, spare, hidden)
     notes = _notes_of_merging(whole, len(grids), place)
     if names := partial | partial_too:
         notes.append(f"Left out data that not all of its {len(grids)} pieces have alike: {_shown(names)}.")

@@ -156,7 +156,8 @@ class _Reader:
             raise self._document.damaged(f"its cells have no {lacking[0]}")
         types = self._document.array(tables["types"], count)
         offsets = np.concatenate(([0], self._integers(tables["offsets"], count)))
-        nodes = self._integers(tables["connectivity"], None)
+        is_of_any_size = tables["connectivity"].get("type") == "vtkIdType"
+        nodes = self._integers(tables["connectivity"], int(offsets[-1]) if is_of_any_size else None)
         polyhedra = self._polyhedra(tables, types) if (types == _POLYHEDRON).any() else NO_POLYHEDRA
         return checked(self._document.path, types, nodes, offsets, polyhedra)
 

@@ -8,7 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from difftetvr.mesh.io.content import CellBlock, Content
+from difftetvr.mesh.io.formats.vtk.grid import hidden_notes
 from difftetvr.mesh.io.formats.xdmf.topology import Shape
+from difftetvr.mesh.making.conversion import is_convertible
 
 
 @dataclass(frozen=True)
@@ -35,6 +37,7 @@ class Assembly:
         self._num_cells = 0
         self._cells: dict[str, list[CellBlock]] = {}
         self._data: dict[str, dict[str, list[_Data]]] = {"point": {}, "cell": {}}
+        self._marks: list[_Data] = []
 
     def add(self, shape: Shape) -> tuple[np.ndarray, np.ndarray]:
         """Adds a grid.
@@ -86,13 +89,34 @@ class Assembly:
             unique = f"{name} ({number})"
         there.setdefault(unique, []).append(_Data(rows, values))
 
+    def mark(self, rows: np.ndarray, unseen: np.ndarray) -> None:
+        """Takes note of cells that are not to be seen, unless another grid that tells these says that they are.
+
+        Args:
+            rows: (N,) of a grid's cells, as `add` returns them.
+            unseen: (N,) truth values.
+        """
+        self._marks.append(_Data(rows, unseen))
+
     def content(self, notes: tuple[str, ...]) -> Content:
         """What was put together."""
         arrays = [vertices for _, vertices in self._points.values()]
-        cells = tuple(_joined(kind, blocks) for kind, blocks in self._cells.items())
+        hidden, blocks = self._hidden(), [_joined(kind, blocks) for kind, blocks in self._cells.items()]
+        left_out = sum(int(hidden[block.rows].sum()) for block in blocks if is_convertible(block.kind))
+        cells = tuple(CellBlock(b.kind, b.nodes[~hidden[b.rows]], b.rows[~hidden[b.rows]]) for b in blocks)
         point_data = {n: _spread(data, self.num_points) for n, data in self._data["point"].items()}
         cell_data = {n: _spread(data, self._num_cells) for n, data in self._data["cell"].items()}
-        return Content(np.concatenate(arrays or [np.empty((0, 3))]), cells, point_data, cell_data, notes)
+        vertices = np.concatenate(arrays or [np.empty((0, 3))])
+        notes = (*notes, *hidden_notes(left_out))
+        return Content(vertices, cells, point_data, cell_data, notes, hidden=left_out)
+
+    def _hidden(self) -> np.ndarray:
+        """(N,) which of all cells are not to be seen."""
+        seen, unseen = np.zeros(self._num_cells, bool), np.zeros(self._num_cells, bool)
+        for mark in self._marks:
+            seen[mark.rows[~mark.values]] = True
+            unseen[mark.rows[mark.values]] = True
+        return unseen & ~seen
 
     def _known(self, kind: str, nodes: np.ndarray) -> np.ndarray:
         """(N,) rows of cells that are there already, with the same nodes in any order; -1 for others."""

@@ -11,6 +11,7 @@ import numpy as np
 
 from difftetvr.errors import MeshError, counted
 from difftetvr.mesh.io.content import Content, chosen_step, damaged
+from difftetvr.mesh.io.formats.vtk.grid import GHOSTS, are_unseen
 from difftetvr.mesh.io.formats.xdmf.assembly import Assembly
 from difftetvr.mesh.io.formats.xdmf.document import Document
 from difftetvr.mesh.io.formats.xdmf.items import Items
@@ -20,6 +21,8 @@ from difftetvr.mesh.io.isolation import isolated
 
 _DEEPEST, _MOST_VISITS = 16, 100_000
 _PLACES = {"node": "point", "": "point", "cell": "cell"}
+_TENSOR_AS_VTK = [0, 3, 5, 1, 4, 2]
+"""Where VTK's components xx yy zz xy yz xz of a symmetric tensor stand in XDMF's order xx xy xz yy yz zz."""
 
 _Key = tuple[float, int]
 """A time, and which of the steps with this time."""
@@ -209,8 +212,12 @@ class _Reader:
                 self.left_out[f"{name[:80]!r} ({kind[:40]})"] = None
                 continue
             values = self._values(attribute, len(rows[place]))
-            if values is not None:
+            if values is None:
+                continue
+            if name not in GHOSTS:
                 assembly.put(place, name, rows[place], values)
+            elif place == "cell" and values.ndim == 1:
+                assembly.mark(rows[place], are_unseen(name, values.astype(np.int64)))
 
     def _values(self, attribute: Element, count: int) -> np.ndarray | None:
         """(count, ...) numbers; None, and a word about it, for others."""
@@ -219,6 +226,9 @@ class _Reader:
             values = arrays[0]
             if len(values) != count:
                 values = values.reshape(count, -1)
+            kind = attribute.get("AttributeType", attribute.get("Type", "")).lower()
+            if kind == "tensor6" and values.size == 6 * count:
+                return values.reshape(count, 6)[:, _TENSOR_AS_VTK]
             return values[:, 0] if values.ndim == 2 and values.shape[1] == 1 else values
         sizes = " + ".join(str(values.size) for values in arrays) or "no"
         self.left_out[f"{name[:80]!r} ({sizes} numbers for {counted(count, 'row')})"] = None

@@ -147,9 +147,12 @@ def _cells(items: Items, topology: Element, name: str) -> tuple[CellBlock, ...]:
     arrays = items.of(topology)
     if len(arrays) != 1 or arrays[0].dtype.kind not in "iu":
         raise damaged(items.path, "its cells are no array of integers")
+    base, order = _base(items, topology), topology.get("Order", "").split()
     nodes = arrays[0].astype(np.int64)
     if name == "mixed":
-        return _mixed(items.path, nodes.ravel())
+        if order:
+            raise damaged(items.path, "cells of several kinds have one order of nodes")
+        return tuple(CellBlock(b.kind, b.nodes - base, b.rows) for b in _mixed(items.path, nodes.ravel()))
     number = int(name) if name.isascii() and name.isdigit() and len(name) < 9 else _NUMBERS.get(name, 0)
     if number == _POLYHEDRON or number not in (*_KINDS, _POLYGON):
         raise MeshError(f"{items.path} has cells of the kind {name[:40]!r}, which is not read; write tetrahedra.")
@@ -160,8 +163,21 @@ def _cells(items: Items, topology: Element, name: str) -> tuple[CellBlock, ...]:
         kind = kind if size == _KINDS.get(number, ("", 0))[1] else "polygon"
     if not size or nodes.size % size:
         raise damaged(items.path, f"{nodes.size} indices make no cells of the kind {kind!r}")
-    table = nodes.reshape(-1, size)
+    table = nodes.reshape(-1, size) - base
+    if order:
+        if sorted(order) != sorted(map(str, range(size))):
+            raise damaged(items.path, f"{' '.join(order)[:40]!r} is no order of {size} nodes")
+        table = table[:, list(map(int, order))]
     return (CellBlock(kind, table, np.arange(len(table))),)
+
+
+def _base(items: Items, topology: Element) -> int:
+    """The index of the first point."""
+    arrays = [child for child in items.document.children(topology) if child.tag == "DataItem"]
+    text = next((text for e in (topology, *arrays) if (text := e.get("BaseOffset"))), "0")
+    if not text.isascii() or not text.isdigit() or len(text) > 18:
+        raise damaged(items.path, f"{text[:40]!r} is no index of its first point")
+    return int(text)
 
 
 def _mixed(path: Path, numbers: np.ndarray) -> tuple[CellBlock, ...]:
