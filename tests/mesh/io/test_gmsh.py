@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from difftetvr.errors import MeshError
-from difftetvr.mesh.io import load_data
+from difftetvr.mesh import TetMesh
+from difftetvr.mesh.io import load_data, save
 from difftetvr.mesh.io.formats.gmsh import reading
 
 meshio = pytest.importorskip("meshio")
@@ -280,3 +281,19 @@ def test_what_meshio_writes(tmp_path, form, kind):
     corners = 4 if kind == "tetra10" else 8
     assert found.mesh.vertices.tolist() == points[:corners].tolist()
     assert found.point_data["v"].tolist() == values[:corners].tolist()
+
+
+def test_groups_are_read_back(tmp_path):
+    """Of each cell its own, also where cells of one entity lie in several groups, as other programs write it."""
+    mesh = TetMesh(POINTS, TETS)
+    for name, values in (
+        ("a", {"gmsh:physical": [5, 7], "gmsh:geometrical": [1, 1]}),
+        ("b", {"gmsh:physical": [9, 0]}),
+    ):
+        save(tmp_path / f"{name}.msh", mesh, cell_data=values)
+        found = load_data(tmp_path / f"{name}.msh")
+        assert {n: v.tolist() for n, v in found.cell_data.items()} == {"gmsh:geometrical": [2, 1], **values}
+    for odd in ([-1, 2], [2**31, 1], [0.5, 1.0], [np.nan, 1.0]):
+        save(tmp_path / "b.msh", mesh, cell_data={"gmsh:physical": np.array(odd)})
+        found = load_data(tmp_path / "b.msh", torch.float64).cell_data["gmsh:physical"]
+        assert np.array_equal(found.numpy(), odd, equal_nan=True)

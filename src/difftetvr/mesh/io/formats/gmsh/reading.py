@@ -192,7 +192,8 @@ def _groups(groups: Groups, elements: list[Elements], form: _Format) -> tuple[di
     inner = np.concatenate([table[:0], *volumes])
     if form.version == "2":
         names = ("gmsh:physical", "gmsh:geometrical")[: table.shape[1]]
-        found = {name: table[:, i] for i, name in enumerate(names)}
+        # A physical group of 0 is none, and one of the two tags that most programs insist on.
+        found = {name: table[:, i] for i, name in enumerate(names) if i or table[:, i].any()}
         return found, groups.notes(set(inner[:, 0].tolist()), set())
     found = {"gmsh:geometrical": table[:, 1]}
     if groups.physical and (physical := groups.of(table)).any():
