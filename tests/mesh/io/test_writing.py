@@ -139,7 +139,7 @@ def test_shapes_of_rows(tmp_path, suffix, shape):
 def test_rows_of_other_shapes_are_said(tmp_path):
     values = np.arange(4.0 * V).reshape(V, 2, 2)
     for suffix in (".vtu", ".vtk"):
-        with pytest.warns(MeshWarning, match=r"The data 'x' were written as rows of numbers\.$"):
+        with pytest.warns(MeshWarning, match=r"the data 'x' were written as rows of numbers\.$"):
             dtv.save(tmp_path / f"a{suffix}", MESH, point_data={"x": values})
         found = dtv.load_data(tmp_path / f"a{suffix}", torch.float64).point_data["x"]
         assert found.tolist() == values.reshape(V, 4).tolist()
@@ -154,9 +154,9 @@ def test_numbers_of_components_that_gmsh_knows(tmp_path):
     with pytest.warns(MeshWarning) as caught:
         dtv.save(path, MESH, point_data={"full": tensor, "half": symmetric, "uv": plane}, cell_data={"rgba": color})
     assert [str(w.message).removeprefix(f"{path}: ") for w in caught] == [
-        "The data 'uv' were written with a third component of 0, as Gmsh knows 1, 3 and 9 components.",
-        "The data 'half' were written as symmetric tensors of 9 components, as Gmsh knows 1, 3 and 9 components.",
-        "The data 'rgba' were written one component at a time, their names ending in :0, :1, ..., as Gmsh knows 1, 3 "
+        "the data 'uv' were written with a third component of 0, as Gmsh knows 1, 3 and 9 components.",
+        "the data 'half' were written as symmetric tensors of 9 components, as Gmsh knows 1, 3 and 9 components.",
+        "the data 'rgba' were written one component at a time, their names ending in :0, :1, ..., as Gmsh knows 1, 3 "
         "and 9 components.",
     ]
     data = dtv.load_data(path, torch.float64)
@@ -171,7 +171,7 @@ def test_numbers_of_components_that_gmsh_knows(tmp_path):
 
 def test_whole_numbers_that_gmsh_rounds_are_said(tmp_path):
     large = torch.full((V,), 2**53 + 1)
-    with pytest.warns(MeshWarning, match="The data 'id' were rounded, as Gmsh's numbers are exact up to"):
+    with pytest.warns(MeshWarning, match="the data 'id' were rounded, as Gmsh's numbers are exact up to"):
         dtv.save(tmp_path / "a.msh", MESH, point_data={"id": large})
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -55,6 +55,7 @@ def save(
     *,
     point_data: Mapping[str, Any] | None = None,
     cell_data: Mapping[str, Any] | None = None,
+    group_names: Mapping[int, str] | None = None,
 ) -> None:
     """Writes a mesh with its field and data; the suffix chooses the format.
 
@@ -74,13 +75,15 @@ def save(
         point_data: More arrays of one row for each vertex, by name, tensors or what NumPy makes arrays of; .vtu, .vtk,
             .msh, .xdmf and .npz hold them.
         cell_data: More arrays of one row for each cell, by name.
+        group_names: Names of the groups in the cell data ``gmsh:physical``, by number, as a .msh holds them; see
+            `MeshData`.
 
     Raises:
         MeshError: The field or the data do not fit the mesh, the suffix names a format that cannot hold them, rounding
             to float32 would flatten or invert a cell, or the file cannot be written.
 
     Warns:
-        MeshWarning: Data were written in another shape or precision than they have.
+        MeshWarning: Data were written in another shape or precision than they have, or names of groups left out.
     """
     path = Path(path)
     location = None if field is None else field.location_on(mesh)
@@ -105,10 +108,14 @@ def save(
     own.update(arrays)
     if kind.is_single:
         mesh = mesh.with_origin(WORLD).to(dtype=torch.float32)
-    output = Output(_vertices(mesh), _numbers(mesh.tets), on_vertices, on_cells, location == "cell" and is_field, path)
+    names = _group_names(path, group_names)
+    is_per_cell = location == "cell" and is_field
+    output = Output(_vertices(mesh), _numbers(mesh.tets), on_vertices, on_cells, is_per_cell, path, names)
     with atomic_write(path, MeshError) as temporary:
-        notes = kind.write(temporary, output)
-    for note in notes or ():
+        notes = kind.write(temporary, output) or ()
+    if names and not kind.holds_groups:
+        notes = (*notes, f"{path}: the names of groups were left out, as a '{path.suffix}' holds none.")
+    for note in notes:
         warnings.warn(note, MeshWarning, stacklevel=2)
 
 
@@ -186,6 +193,17 @@ def _numbers(values: Any) -> np.ndarray:
     if array.dtype.kind == "b":
         return array.astype(np.int64)
     return array.astype(np.float32) if array.dtype == np.float16 else array
+
+
+def _group_names(path: Path, names: Mapping[int, str] | None) -> dict[int, str]:
+    require_type(names, (Mapping, type(None)), "group_names", "pass a dict of names by numbers", MeshError)
+    found = dict(names or {})
+    for tag, name in found.items():
+        if not isinstance(tag, int) or not isinstance(name, str) or not _is_text(name):
+            raise MeshError(
+                f"{path}: group_names say {shown(name)} of {shown(tag)}; give names that are text by whole numbers."
+            )
+    return found
 
 
 def _is_text(name: str) -> bool:

@@ -64,4 +64,4 @@ def said(path: Path, names: Iterable[str], what: str) -> tuple[str, ...]:
         what: The sentence's end: "rounded".
     """
     words = [repr(name[:80]) for name in sorted(set(names))]
-    return (f"{path}: The data {listed(words)} were {what}.",) if words else ()
+    return (f"{path}: the data {listed(words)} were {what}.",) if words else ()

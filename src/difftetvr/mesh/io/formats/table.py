@@ -28,6 +28,7 @@ class Format:
         holds_field: Whether it holds colour and density beside the geometry.
         holds_data: Whether it holds any other data of vertices and cells by their names.
         holds_harmonics: Whether it holds what colours owe to the direction, too.
+        holds_groups: Whether it holds names of groups of cells.
         is_single: Whether it holds float32 only.
         has_steps: Whether a file may hold several time steps; see `difftetvr.mesh.io.content.chosen_step`.
     """
@@ -37,6 +38,7 @@ class Format:
     holds_field: bool = True
     holds_data: bool = False
     holds_harmonics: bool = False
+    holds_groups: bool = False
     is_single: bool = False
     has_steps: bool = False
 
@@ -102,7 +104,7 @@ _VTK_XML = (
 FORMATS: dict[str, Format] = {
     ".vtu": Format(lists.read, xml_writing.write, holds_data=True, holds_harmonics=True, has_steps=True),
     ".vtk": Format(legacy.read, legacy_writing.write, holds_data=True),
-    ".msh": Format(gmsh_reading.read, gmsh_writing.write, holds_data=True, has_steps=True),
+    ".msh": Format(gmsh_reading.read, gmsh_writing.write, holds_data=True, holds_groups=True, has_steps=True),
     ".xdmf": Format(xdmf_reading.read, xdmf_writing.write, holds_data=True, has_steps=True),
     ".xmf": Format(xdmf_reading.read, has_steps=True),
     ".npz": Format(npz.read, npz.write, holds_data=True, holds_harmonics=True),

@@ -157,7 +157,8 @@ def _content(source: Source, state: _State, form: _Format, step: int | None) -> 
             point_data[name] = values
             if differ:
                 notes.append(f"Averaged {view.name[:80]!r} at vertices, as each cell has its own values at its nodes.")
-    return Content(vertices, tuple(blocks), point_data, cell_data, (*notes, *state.views.notes))
+    notes += state.views.notes
+    return Content(vertices, tuple(blocks), point_data, cell_data, tuple(notes), state.groups.names_of_volumes)
 
 
 def _only_mesh(source: Source, state: _State) -> _Mesh:

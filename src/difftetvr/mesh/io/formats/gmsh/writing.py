@@ -22,7 +22,7 @@ _PHYSICAL, _GEOMETRICAL = "gmsh:physical", "gmsh:geometrical"
 _TETRA = 4
 _LARGEST_TAG = 2**31 - 1
 _LARGEST_WHOLE = 2**53
-_LONGEST_NAME = 255
+_LONGEST_NAME, _LONGEST_GROUP = 255, 127
 _PADDED, _AS_TENSORS, _APART = _CHANGES = (
     "with a third component of 0",
     "as symmetric tensors of 9 components",
@@ -50,6 +50,7 @@ def write(path: Path, output: Output) -> tuple[str, ...]:
         MeshError: Gmsh cannot read a name.
     """
     require_names(output, _problem)
+    _require_group_names(output)
     output, shapes = flattened(output)
     output, groups = _without_groups(output)
     point_data, of_points = _components(output.path, output.point_data)
@@ -58,6 +59,7 @@ def write(path: Path, output: Output) -> tuple[str, ...]:
     rounded = said(output.path, _too_large(output), "rounded, as Gmsh's numbers are exact up to 2^53 only")
     with open(path, "wb") as file:
         file.write(b"$MeshFormat\n2.2 1 8\n" + np.array([1], "<i4").tobytes() + b"\n$EndMeshFormat\n")
+        _write_group_names(file, output.group_names)
         file.write(f"$Nodes\n{len(output.vertices)}\n".encode())
         _write_tagged(file, output.vertices, "$EndNodes")
         _write_elements(file, output.tets, groups)
@@ -67,6 +69,21 @@ def write(path: Path, output: Output) -> tuple[str, ...]:
                 file.write(f'${section}\n1\n"{name}"\n1\n0.0\n{sizes}'.encode())
                 _write_tagged(file, values, f"$End{section}")
     return (*shapes, *(note for notes in changed for note in notes), *rounded)
+
+
+def _require_group_names(output: Output) -> None:
+    for tag, name in output.group_names.items():
+        if len(name.encode()) > _LONGEST_GROUP or control_problem(name, others='"') or not 0 < tag <= _LARGEST_TAG:
+            raise MeshError(
+                f"{output.path}: Gmsh cannot read the group {tag} named {name[:80]!r}; give groups from 1 on names of "
+                f"at most {_LONGEST_GROUP} bytes without control characters and quotes."
+            )
+
+
+def _write_group_names(file: BinaryIO, names: dict[int, str]) -> None:
+    if names:
+        lines = "".join(f'3 {tag} "{name}"\n' for tag, name in names.items())
+        file.write(f"$PhysicalNames\n{len(names)}\n{lines}$EndPhysicalNames\n".encode())
 
 
 def _write_tagged(file: BinaryIO, values: np.ndarray, end: str) -> None:
