@@ -206,9 +206,20 @@ def test_archives_tell_vertices_from_cells(tmp_path):
     field = dtv.Field(torch.rand(12, 3), torch.rand(12), location="cell")
     with pytest.raises(MeshError, match="cannot tell data of cells from those of vertices"):
         dtv.save(tmp_path / "a.npz", grid, field, cell_data={"id": np.arange(12)})
+    with pytest.raises(MeshError, match="cannot tell data of cells from those of vertices"):
+        dtv.save(tmp_path / "a.npz", grid, field, point_data={"harmonics": np.arange(12)})
     dtv.save(tmp_path / "a.npz", grid, field, point_data={"id": np.arange(12)})
     data = dtv.load_data(tmp_path / "a.npz")
     assert data.field.location == "cell" and "id" in data.point_data
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("name", ["color", "density", "harmonics"])
+def test_one_array_of_a_field_is_data(tmp_path, suffix, name):
+    values = np.arange(V, dtype=float)
+    dtv.save(tmp_path / f"a{suffix}", MESH, point_data={name: values})
+    data = dtv.load_data(tmp_path / f"a{suffix}")
+    assert data.field is None and data.point_data[name].tolist() == values.tolist()
 
 
 @pytest.mark.parametrize(

@@ -77,14 +77,15 @@ def write(path: Path, output: Output) -> None:
     arrays: dict[str, Any] = {"vertices": output.vertices, "tets": output.tets, **output.point_data, **output.cell_data}
     if len(arrays) < 2 + len(output.point_data) + len(output.cell_data):
         raise MeshError(f"{output.path}: in this format all data need names of their own; rename some, or use .vtu.")
-    has_field = output.rgba is not None
-    told_apart = _PLACED if has_field and output.is_per_cell else ()
-    if len(output.vertices) == len(output.tets) and not set(output.cell_data) <= set(told_apart):
+    # What belongs to cells is marked so with a field of cells only, and then all that has the names of its arrays.
+    placed = set(_PLACED) if output.is_per_cell else set[str]()
+    is_clear = set(output.cell_data) <= placed and not placed.intersection(output.point_data)
+    if len(output.vertices) == len(output.tets) and not is_clear:
         raise MeshError(
             f"{output.path}: this format cannot tell data of cells from those of vertices where there are as many of "
             "both; use .vtu."
         )
-    if has_field:
+    if {"color", "density"} & arrays.keys():
         arrays["location"] = np.array("cell" if output.is_per_cell else "vertex")
     # What numpy.savez writes, but that takes some names for arguments of its own.
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
