@@ -25,6 +25,10 @@ class MeshError(DiffTetError):
     """A tetrahedral mesh or the field on it is invalid, or a mesh file cannot be read or written."""
 
 
+class MeshWarning(UserWarning):
+    """Something that a mesh file cannot hold as it was given, and what was written instead."""
+
+
 class CaptureError(DiffTetError):
     """Images, cameras, volumes or transfer functions that a reconstruction starts from are invalid."""
 

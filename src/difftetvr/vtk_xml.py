@@ -26,7 +26,7 @@ import numpy as np
 from difftetvr.errors import DiffTetError
 from difftetvr.trust import require_modest, require_regular
 
-_TYPES = {
+TYPES = {
     "Int8": "i1",
     "UInt8": "u1",
     "Int16": "i2",
@@ -38,6 +38,8 @@ _TYPES = {
     "Float32": "f4",
     "Float64": "f8",
 }
+"""NumPy's name of a type, without byte order, by VTK's."""
+
 _BIT = "Bit"
 _ID = "vtkIdType"  # of 8 bytes, or of 4, as VTK was built
 
@@ -52,7 +54,7 @@ Unpack = Callable[[Any, int], bytes]
 
 def is_numeric(array: Element) -> bool:
     """Whether a DataArray holds numbers, not text or things that only VTK knows."""
-    return array.get("type") in (*_TYPES, _BIT, _ID)
+    return array.get("type") in (*TYPES, _BIT, _ID)
 
 
 class Document:
@@ -140,7 +142,7 @@ class Document:
         if not is_numeric(element):
             raise self.damaged(f"the array {name!r} is of type {kind[:40]!r}, where numbers must be")
         is_bits = kind == _BIT
-        dtype = np.dtype(self._order + (_TYPES | {_ID: "i8"}).get(kind, "u1"))
+        dtype = np.dtype(self._order + (TYPES | {_ID: "i8"}).get(kind, "u1"))
         if _storage(element) == "ascii":
             values = self._parsed_numbers(element.text or "", dtype.newbyteorder("="), name)
         else:

@@ -83,6 +83,39 @@ def test_export_says_what_is_left_out(tmp_path, flat_mesh, capsys):
     assert load_data(tmp_path / "b.vtu").mesh.num_cells == 6
 
 
+@pytest.mark.parametrize("suffix", [".vtu", ".vtk", ".xdmf", ".npz"])
+def test_export_keeps_names_and_components(tmp_path, capsys, suffix):
+    mesh = TetMesh.grid((2, 2, 1))
+    data = {name: torch.rand(18, 2) for name in ("p & q", "T<300", 'a"b', "my scalar", "Größe")}
+    save(tmp_path / "a.npz", mesh, point_data=data)
+    output = tmp_path / f"b{suffix}"
+    assert cli.main(["export", str(tmp_path / "a.npz"), str(output)]) == 0
+    printed = capsys.readouterr()
+    assert "without" not in printed.out and printed.err == ""
+    found = load_data(output).point_data
+    assert found.keys() == data.keys() and all(torch.equal(found[name], data[name]) for name in data)
+
+
+def test_export_to_gmsh_keeps_groups_and_says_what_it_changes(tmp_path, capsys):
+    mesh = TetMesh.grid((2, 2, 1))
+    groups = {"gmsh:physical": torch.arange(24) % 3 + 5, "gmsh:geometrical": torch.ones(24, dtype=torch.int64)}
+    names = {5: "soft tissue", 7: "bone"}
+    save(tmp_path / "a.msh", mesh, cell_data=groups, point_data={"p": torch.rand(18)}, group_names=names)
+    assert cli.main(["export", str(tmp_path / "a.msh"), str(tmp_path / "b.msh")]) == 0
+    assert capsys.readouterr().err == ""
+    assert load_data(tmp_path / "b.msh").group_names == names
+    found = load_data(tmp_path / "b.msh").cell_data
+    assert found.keys() == groups.keys() and all(torch.equal(found[name], groups[name]) for name in groups)
+    save(tmp_path / "a.vtu", mesh, point_data={"stress": torch.rand(18, 6)})
+    assert cli.main(["export", str(tmp_path / "a.vtu"), str(tmp_path / "b.msh")]) == 0
+    printed = capsys.readouterr()
+    assert printed.out == f"Wrote {tmp_path / 'b.msh'} (24 cells, stress)\n"
+    assert printed.err.count("\n") == 1 and "the data 'stress' were written as symmetric tensors" in printed.err
+    save(tmp_path / "a.npz", mesh, point_data={"a\x01b": torch.rand(18)})
+    assert "which XML does not know; rename it" in fails(capsys, "export", tmp_path / "a.npz", tmp_path / "c.vtu")
+    assert not (tmp_path / "c.vtu").exists()
+
+
 def test_models_are_read_less_their_flat_cells(flat_mesh, tmp_path, capsys):
     mesh, field = load_model(flat_mesh, "cpu")
     assert mesh.num_cells == 1 and len(field) == 4

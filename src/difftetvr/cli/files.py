@@ -133,7 +133,8 @@ class Export:
         others = [{n: v for n, v in d.items() if n not in of_field} for d in (data.point_data, data.cell_data)]
         if self.geometry or not holds_data(self.output):
             others = [{}, {}]
-        save(self.output, data.mesh, field_on_mesh, point_data=others[0], cell_data=others[1])
+        names = data.group_names if any(others) else {}
+        save(self.output, data.mesh, field_on_mesh, point_data=others[0], cell_data=others[1], group_names=names)
         written = (*written, *sorted({*others[0], *others[1]}))
         left_out = sorted({*data.point_data, *data.cell_data}.difference(written))
         content = listed(written) if written else "geometry only"

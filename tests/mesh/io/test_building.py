@@ -119,7 +119,12 @@ def test_what_cannot_be_saved_is_refused(tmp_path):
             dtv.save(tmp_path / f"a.{suffix}", mesh, field)
     with pytest.raises(dtv.MeshError, match="have the name of what the field is saved as"):
         dtv.save(tmp_path / "a.vtu", mesh, field, point_data={"scalar": torch.zeros(mesh.num_vertices)})
-    for wrong in (torch.zeros(5), torch.zeros(mesh.num_vertices, 2, 2), np.array(["a"] * mesh.num_vertices)):
+    for wrong in (
+        torch.zeros(5),
+        torch.zeros(mesh.num_vertices, 0),
+        torch.zeros(mesh.num_vertices).cfloat(),
+        np.array(["a"] * mesh.num_vertices),
+    ):
         with pytest.raises(dtv.MeshError, match="the data 'x' are"):
             dtv.save(tmp_path / "a.vtu", mesh, point_data={"x": wrong})
     assert not list(tmp_path.iterdir())

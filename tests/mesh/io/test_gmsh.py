@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from difftetvr.errors import MeshError
-from difftetvr.mesh.io import load_data
+from difftetvr.errors import MeshError, MeshWarning
+from difftetvr.mesh import TetMesh
+from difftetvr.mesh.io import load_data, save
 from difftetvr.mesh.io.formats.gmsh import reading
 
 meshio = pytest.importorskip("meshio")
@@ -293,3 +294,34 @@ def test_what_meshio_writes(tmp_path, form, kind):
     corners = 4 if kind == "tetra10" else 8
     assert found.mesh.vertices.tolist() == points[:corners].tolist()
     assert found.point_data["v"].tolist() == values[:corners].tolist()
+
+
+def test_names_of_groups_are_kept(tmp_path):
+    mesh, groups = TetMesh(POINTS, TETS), {"gmsh:physical": np.array([5, 7])}
+    names = {5: "soft tissue", 7: "Größe & <>'", 9: "a" * 127}
+    save(tmp_path / "a.msh", mesh, cell_data=groups, group_names=names)
+    data = load_data(tmp_path / "a.msh")
+    assert data.group_names == names
+    assert data.warnings == ("Of the physical groups in gmsh:physical, 5 is 'soft tissue', 7 is \"Größe & <>'\".",)
+    with pytest.warns(MeshWarning, match="the names of groups were left out, as a '.vtu' holds none"):
+        save(tmp_path / "a.vtu", mesh, cell_data=groups, group_names=names)
+    for wrong in ({5: 'a"b'}, {5: "a\nb"}, {0: "a"}, {5: "a" * 128}, {5: 3}, {"a": "b"}, {5: "\ud800"}, ["a"]):
+        with pytest.raises(MeshError, match=r"Gmsh cannot read the group|group_names"):
+            save(tmp_path / "b.msh", mesh, cell_data=groups, group_names=wrong)
+    assert not (tmp_path / "b.msh").exists()
+
+
+def test_groups_are_read_back(tmp_path):
+    """Of each cell its own, also where cells of one entity lie in several groups, as other programs write it."""
+    mesh = TetMesh(POINTS, TETS)
+    for name, values in (
+        ("a", {"gmsh:physical": [5, 7], "gmsh:geometrical": [1, 1]}),
+        ("b", {"gmsh:physical": [9, 0]}),
+    ):
+        save(tmp_path / f"{name}.msh", mesh, cell_data=values)
+        found = load_data(tmp_path / f"{name}.msh")
+        assert {n: v.tolist() for n, v in found.cell_data.items()} == {"gmsh:geometrical": [2, 1], **values}
+    for odd in ([-1, 2], [2**31, 1], [0.5, 1.0], [np.nan, 1.0]):
+        save(tmp_path / "b.msh", mesh, cell_data={"gmsh:physical": np.array(odd)})
+        found = load_data(tmp_path / "b.msh", torch.float64).cell_data["gmsh:physical"]
+        assert np.array_equal(found.numpy(), odd, equal_nan=True)

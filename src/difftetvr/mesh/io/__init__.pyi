@@ -19,6 +19,7 @@ from .loading import load_mesh as load_mesh
 from .loading import load_with_optional_field as load_with_optional_field
 from .saving import GEOMETRY_SUFFIXES as GEOMETRY_SUFFIXES
 from .saving import WRITABLE_SUFFIXES as WRITABLE_SUFFIXES
+from .saving import MeshWarning as MeshWarning
 from .saving import Storable as Storable
 from .saving import holds_data as holds_data
 from .saving import require_writable_format as require_writable_format
@@ -35,6 +36,7 @@ __all__ = [
     "Defects",
     "Flat",
     "MeshData",
+    "MeshWarning",
     "Scalar",
     "Storable",
     "holds_data",

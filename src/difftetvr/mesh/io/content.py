@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TextIO
 
@@ -40,6 +40,7 @@ class Content:
         point_data: Arrays of V rows.
         cell_data: Arrays of one row for each cell, in the order that `CellBlock.rows` refers to.
         notes: Sentences about what the file holds and the content does not: one for each kind of thing.
+        group_names: Names of the groups of volumes in the cell data ``gmsh:physical``, by number.
         hidden: Number of volume cells that are not among the cells, as the file says that they are not to be seen.
     """
 
@@ -48,6 +49,7 @@ class Content:
     point_data: dict[str, np.ndarray]
     cell_data: dict[str, np.ndarray]
     notes: tuple[str, ...] = ()
+    group_names: dict[int, str] = field(default_factory=dict)
     hidden: int = 0
 
 
@@ -62,6 +64,7 @@ class Output:
         cell_data: Arrays of T rows by name, among them those of a field on the cells.
         is_per_cell: Whether colour and density belong to the cells.
         path: Where the file will be in the end; a temporary one is written first.
+        group_names: As of `Content`.
     """
 
     vertices: np.ndarray
@@ -70,6 +73,7 @@ class Output:
     cell_data: dict[str, np.ndarray]
     is_per_cell: bool
     path: Path
+    group_names: dict[int, str] = field(default_factory=dict)
 
     @property
     def rgba(self) -> np.ndarray | None:

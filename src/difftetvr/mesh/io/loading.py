@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -38,6 +39,7 @@ class MeshData:
         warnings: Sentences about what was left out or changed.
         defects: What is wrong with the file's cells, as far as they were loaded all the same.
         repair: What repairing the mesh changed, in words; None where nothing was.
+        group_names: Names of the physical groups of Gmsh that the cell data ``gmsh:physical`` count, by number.
     """
 
     mesh: TetMesh
@@ -47,6 +49,7 @@ class MeshData:
     warnings: tuple[str, ...] = ()
     defects: Defects = NO_DEFECTS
     repair: str | None = None
+    group_names: dict[int, str] = dataclasses.field(default_factory=dict)
 
     @property
     def flat_cells(self) -> int:
@@ -173,7 +176,8 @@ def _load(request: Request) -> tuple[MeshData, MeshError | None]:
         if unused
         else built.notes
     )
-    found = MeshData(mesh, None, data["vertex"], data["cell"], notes, built.defects, built.repair)
+    about = notes, built.defects, built.repair, content.group_names
+    found = MeshData(mesh, None, data["vertex"], data["cell"], *about)
     location = next((place for place, arrays in stored.items() if all(n in arrays for n in FIELD_ARRAYS)), None)
     if location is None:
         return found, None

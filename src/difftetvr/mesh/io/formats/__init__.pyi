@@ -1,5 +1,6 @@
 from . import abaqus as abaqus
 from . import bintet as bintet
+from . import data as data
 from . import exodus as exodus
 from . import gmsh as gmsh
 from . import medit as medit

@@ -8,7 +8,16 @@ from pathlib import Path
 import numpy as np
 
 from difftetvr.errors import MeshError
-from difftetvr.mesh.io.content import CellBlock, Content, as_indices, damaged, parse_numbers
+from difftetvr.mesh.io.content import (
+    CellBlock,
+    Content,
+    Output,
+    all_digits,
+    as_indices,
+    damaged,
+    parse_numbers,
+    write_table,
+)
 
 _CELLS = {
     "edges": ("line", 2),
@@ -62,6 +71,21 @@ def read(path: Path) -> Content:
         {"medit:ref": as_indices(path, points[:, 3])},
         {"medit:ref": np.concatenate(references)},
     )
+
+
+def write(path: Path, output: Output) -> None:
+    """Write a tetrahedral mesh; numbers have all digits that it takes to read the same ones again.
+
+    Args:
+        path: The file to write.
+        output: The mesh; all data are passed over.
+    """
+    with open(path, "w", encoding="ascii", newline="\n") as file:
+        file.write("MeshVersionFormatted 2\nDimension 3\n")
+        for name, table in (("Vertices", output.vertices), ("Tetrahedra", output.tets + 1)):
+            file.write(f"{name}\n{len(table)}\n")
+            write_table(file, table, f"{all_digits(table)} 0")
+        file.write("End\n")
 
 
 def _table(path: Path, text: bytes | None, columns: int, what: str) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +11,13 @@ import numpy as np
 from difftetvr.archive import array_names, read_arrays
 from difftetvr.errors import MeshError
 from difftetvr.mesh.io.content import Content, Output, require_array, tetra_block
+from difftetvr.mesh.io.formats.data import require_names
 
 _VERTICES = ("vertices", "points")
 _TETS = ("tets", "cells")
-_NAMED = ("location", "color", "density", "harmonics")
+_PLACED = ("color", "density", "harmonics")
+_NAMED = ("location", *_PLACED)
+_LONGEST_NAME = 2**15
 
 
 def read(path: Path) -> Content:
@@ -40,7 +44,7 @@ def read(path: Path) -> Content:
     point_data, cell_data = {}, {}
     for name, values in arrays.items():
         rows = len(values) if values.ndim else -1
-        if rows == len(tets) and (rows != len(vertices) or (per_cell and name in ("color", "density", "harmonics"))):
+        if rows == len(tets) and (rows != len(vertices) or (per_cell and name in _PLACED)):
             cell_data[name] = values
         elif rows == len(vertices):
             point_data[name] = values
@@ -64,20 +68,38 @@ def write(path: Path, output: Output) -> None:
 
     Args:
         path: The file to write.
-        output: The mesh, and the field's arrays.
+        output: The mesh, and all data.
+
+    Raises:
+        MeshError: It cannot tell data of vertices from those of cells, or others of ours, by their names and lengths.
     """
+    require_names(output, _problem)
     arrays: dict[str, Any] = {"vertices": output.vertices, "tets": output.tets, **output.point_data, **output.cell_data}
     if len(arrays) < 2 + len(output.point_data) + len(output.cell_data):
         raise MeshError(f"{output.path}: in this format all data need names of their own; rename some, or use .vtu.")
-    if output.cell_data and len(output.vertices) == len(output.tets) and not output.is_per_cell:
+    # What belongs to cells is marked so with a field of cells only, and then all that has the names of its arrays.
+    placed = set(_PLACED) if output.is_per_cell else set[str]()
+    is_clear = set(output.cell_data) <= placed and not placed.intersection(output.point_data)
+    if len(output.vertices) == len(output.tets) and not is_clear:
         raise MeshError(
             f"{output.path}: this format cannot tell data of cells from those of vertices where there are as many of "
             "both; use .vtu."
         )
-    if output.rgba is not None:
+    if {"color", "density"} & arrays.keys():
         arrays["location"] = np.array("cell" if output.is_per_cell else "vertex")
-    with open(path, "wb") as file:
-        np.savez_compressed(file, **arrays)
+    # What numpy.savez writes, but that takes some names for arguments of its own.
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, values in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, values, allow_pickle=False)
+
+
+def _problem(name: str) -> str | None:
+    if name == "location":
+        return "says whether a field is of vertices or of cells"
+    if "\0" in name:
+        return "has the character '\\x00'"
+    return "is too long" if len(name.encode()) > _LONGEST_NAME else None
 
 
 def _row_counts(path: Path) -> set[tuple[int, ...]]:

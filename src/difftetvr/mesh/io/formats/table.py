@@ -11,7 +11,8 @@ from difftetvr.errors import MeshError, shown
 from difftetvr.mesh.io.content import Content, Output
 from difftetvr.mesh.io.formats import abaqus, bintet, exodus, medit, npz, ovm, tetgen, through_meshio, unsupported
 from difftetvr.mesh.io.formats.gmsh import reading as gmsh_reading
-from difftetvr.mesh.io.formats.vtk import legacy, lists, series
+from difftetvr.mesh.io.formats.gmsh import writing as gmsh_writing
+from difftetvr.mesh.io.formats.vtk import legacy, legacy_writing, lists, series, xml_writing
 from difftetvr.mesh.io.formats.xdmf import reading as xdmf_reading
 from difftetvr.mesh.io.formats.xdmf import writing as xdmf_writing
 from difftetvr.trust import require_regular
@@ -25,19 +26,22 @@ class Format:
 
     Attributes:
         read: From a file to its content; where the format has time steps, from a file and the step to read, too.
-        write: From a mesh to a file; None for formats that are only read.
+        write: From a mesh to a file, with sentences about what was written otherwise than it was given, if there are
+            any; None for formats that are only read.
         holds_field: Whether it holds colour and density beside the geometry.
         holds_data: Whether it holds any other data of vertices and cells by their names.
         holds_harmonics: Whether it holds what colours owe to the direction, too.
+        holds_groups: Whether it holds names of groups of cells.
         is_single: Whether it holds float32 only.
         has_steps: Whether a file may hold several time steps; see `difftetvr.mesh.io.content.chosen_step`.
     """
 
     read: Callable[..., Content]
-    write: Callable[[Path, Output], None] | None = None
+    write: Callable[[Path, Output], tuple[str, ...] | None] | None = None
     holds_field: bool = True
     holds_data: bool = False
     holds_harmonics: bool = False
+    holds_groups: bool = False
     is_single: bool = False
     has_steps: bool = False
 
@@ -103,9 +107,9 @@ _VTK_XML = (
 
 
 FORMATS: dict[str, Format] = {
-    ".vtu": Format(lists.read, through_meshio.write, holds_data=True, holds_harmonics=True, has_steps=True),
-    ".vtk": Format(legacy.read, through_meshio.write, holds_data=True),
-    ".msh": Format(gmsh_reading.read, through_meshio.write, holds_data=True, has_steps=True),
+    ".vtu": Format(lists.read, xml_writing.write, holds_data=True, holds_harmonics=True, has_steps=True),
+    ".vtk": Format(legacy.read, legacy_writing.write, holds_data=True),
+    ".msh": Format(gmsh_reading.read, gmsh_writing.write, holds_data=True, holds_groups=True, has_steps=True),
     ".xdmf": Format(xdmf_reading.read, xdmf_writing.write, holds_data=True, has_steps=True),
     ".xmf": Format(xdmf_reading.read, has_steps=True),
     ".npz": Format(npz.read, npz.write, holds_data=True, holds_harmonics=True),
@@ -115,7 +119,7 @@ FORMATS: dict[str, Format] = {
     ".ele": Format(tetgen.read, tetgen.write),
     **dict.fromkeys(exodus.SUFFIXES, Format(exodus.read, has_steps=True)),
     ".inp": Format(abaqus.read),
-    ".mesh": Format(medit.read, through_meshio.write, holds_field=False),
+    ".mesh": Format(medit.read, medit.write, holds_field=False),
     **dict.fromkeys(_VTK_XML, Format(lists.read, has_steps=True)),
     ".series": Format(series.read, has_steps=True),
 }

@@ -1,4 +1,4 @@
-"""Formats that meshio reads and writes for us.
+"""Formats that meshio reads for us.
 
 Its readers trust their files: some never end where one is cut off, others follow what HDF5 links to. They run in a
 process of their own, and only those that are named here.
@@ -16,17 +16,9 @@ from typing import Any
 import numpy as np
 
 from difftetvr.errors import MeshError
-from difftetvr.mesh.io.content import CellBlock, Content, Output, damaged
+from difftetvr.mesh.io.content import CellBlock, Content, damaged
 from difftetvr.mesh.io.hdf5 import PlainFile, load_h5py
 from difftetvr.mesh.io.isolation import isolated
-
-_WRITERS: dict[str, tuple[str, dict[str, Any]]] = {
-    ".vtu": ("vtu", {"binary": True, "compression": "zlib"}),
-    ".vtk": ("vtk", {"binary": True}),
-    ".msh": ("gmsh", {"binary": True}),
-    ".mesh": ("medit", {}),
-}
-"""Format name and options of meshio by suffix."""
 
 SURFACES = (".ply", ".stl", ".obj", ".off")
 """Suffixes of formats that hold surfaces only."""
@@ -84,22 +76,6 @@ def read_here(path: Path, _: int | None = None) -> Content:
     if "cannot handle" in output.getvalue() or "corrupt" in output.getvalue():
         raise damaged(path, _first_line(" ".join(output.getvalue().split())))
     return content
-
-
-def write(path: Path, output: Output) -> None:
-    """Write a tetrahedral mesh with its data in the format that the suffix of ``output.path`` names.
-
-    Args:
-        path: The file to write.
-        output: The mesh, and the field's arrays.
-    """
-    import meshio
-
-    file_format, options = _WRITERS[output.path.suffix.lower()]
-    cell_data = {name: [values] for name, values in output.cell_data.items()}
-    content = meshio.Mesh(output.vertices, [("tetra", output.tets)], point_data=output.point_data, cell_data=cell_data)
-    with _quiet():
-        content.write(str(path), file_format=file_format, **options)
 
 
 class _Text(io.TextIOWrapper):
@@ -174,10 +150,9 @@ def _printed_reason(output: str) -> str:
 
 
 @contextlib.contextmanager
-def _quiet(output: io.StringIO | None = None) -> Iterator[None]:
+def _quiet(output: io.StringIO) -> Iterator[None]:
     """Keeps meshio from printing: its messages are either in the error we raise or of no use to the user."""
-    sink = io.StringIO() if output is None else output
-    with contextlib.redirect_stdout(sink), contextlib.redirect_stderr(sink), warnings.catch_warnings():
+    with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         # NumPy only warns of, and cuts off, what follows the last number that it understands.
         warnings.filterwarnings("error", message="string or file could not be read to its end")

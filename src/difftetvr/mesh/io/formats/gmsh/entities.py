@@ -23,6 +23,11 @@ class Groups:
     names: dict[tuple[int, int], str] = field(default_factory=dict)
     physical: dict[tuple[int, int], list[int]] = field(default_factory=dict)
 
+    @property
+    def names_of_volumes(self) -> dict[int, str]:
+        """Names of physical groups of volumes by tag."""
+        return {abs(tag): name for (dimension, tag), name in self.names.items() if dimension == 3}
+
     def of(self, entities: np.ndarray) -> np.ndarray:
         """The first physical group of entities (N, 2), by dimension and tag: (N,), 0 where there is none."""
         pairs, places = np.unique(entities, axis=0, return_inverse=True)
@@ -30,13 +35,13 @@ class Groups:
         return np.array(first, np.int64)[places.reshape(-1)]
 
     def notes(self, tags: set[int], entities: set[tuple[int, int]]) -> list[str]:
-        """Sentences about names, which are not kept, and about entities in several groups.
+        """Sentences about names, and about entities in several groups.
 
         Args:
             tags: Of physical groups of volumes that cells belong to.
             entities: Of the cells; empty in format 2.
         """
-        said = [f"{tag} is {name!r}" for (d, tag), name in sorted(self.names.items()) if d == 3 and tag in tags]
+        said = [f"{tag} is {name[:80]!r}" for (d, tag), name in sorted(self.names.items()) if d == 3 and tag in tags]
         found = []
         if said:
             more = ", ..." if len(said) > _MOST_NAMES else ""
@@ -56,7 +61,7 @@ def read_names(source: Source, groups: Groups) -> None:
         words = (source.next_line() or "").split(maxsplit=2)
         if len(words) < 3 or not all(word.lstrip("-").isdigit() for word in words[:2]):
             raise source.damaged("the name of a physical group is incomplete")
-        groups.names[int(words[0]), int(words[1])] = words[2].strip().strip('"')[:80]
+        groups.names[int(words[0]), int(words[1])] = words[2].strip().strip('"')
 
 
 def read_entities(source: Source, groups: Groups, data_size: int | None) -> None:

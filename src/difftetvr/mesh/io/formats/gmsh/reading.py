@@ -157,7 +157,8 @@ def _content(source: Source, state: _State, form: _Format, step: int | None) -> 
             point_data[name] = values
             if differ:
                 notes.append(f"Averaged {view.name[:80]!r} at vertices, as each cell has its own values at its nodes.")
-    return Content(vertices, tuple(blocks), point_data, cell_data, (*notes, *state.views.notes))
+    notes += state.views.notes
+    return Content(vertices, tuple(blocks), point_data, cell_data, tuple(notes), state.groups.names_of_volumes)
 
 
 def _only_mesh(source: Source, state: _State) -> _Mesh:
@@ -193,7 +194,8 @@ def _groups(groups: Groups, elements: list[Elements], form: _Format) -> tuple[di
     inner = np.concatenate([part for part, is_volume in zip(tables, are_volumes) if is_volume])
     if form.version == "2":
         names = ("gmsh:physical", "gmsh:geometrical")[: table.shape[1]]
-        found = {name: table[:, i] for i, name in enumerate(names)}
+        # A physical group of 0 is none, and one of the two tags that most programs insist on.
+        found = {name: table[:, i] for i, name in enumerate(names) if i or table[:, i].any()}
         return found, groups.notes(set(inner[:, 0].tolist()), set())
     found = {"gmsh:geometrical": table[:, 1]}
     if groups.physical and (physical := groups.of(table)).any():
