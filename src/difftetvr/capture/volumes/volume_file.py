@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from difftetvr.capture.volumes.stored import require_memory
 from difftetvr.errors import CaptureError
 
 _SHORTEST_PRINTED = 60
@@ -152,6 +153,19 @@ def to_volume(data: bytes, shape: tuple[int, int, int], dtype: np.dtype, source:
         )
     values = np.frombuffer(data, dtype=dtype).reshape(shape[::-1])
     return values.astype(dtype.newbyteorder("="), copy=False)
+
+
+def scaled(values: np.ndarray, slope: float, offset: float, source: Path) -> np.ndarray:
+    """What stored values stand for, slope times each plus offset, in float64; as they are where that changes nothing.
+
+    Raises:
+        CaptureError: There is not enough memory.
+    """
+    if (slope, offset) == (1.0, 0.0):
+        return values
+    require_memory(source, 8 * values.size)
+    with np.errstate(over="ignore"):
+        return values * np.float64(slope) + np.float64(offset)
 
 
 def three_axes(shape: Sequence[int], source: str | Path) -> tuple[int, int, int]:
