@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -121,10 +122,10 @@ def text_to_volume(text: str | bytes, shape: tuple[int, int, int], dtype: np.dty
     """
     data = text.encode() if isinstance(text, str) else text
     try:
-        blocks = [np.array(block.split(), dtype=np.float64) for block in _text_blocks(data)]
+        blocks = [_numbers(block.split(), dtype) for block in _text_blocks(data)]
     except ValueError:
         raise CaptureError(f"The text in '{source}' holds something else than numbers; get the file anew.") from None
-    values = np.concatenate([np.empty(0), *blocks])
+    values = np.concatenate(blocks) if blocks else np.empty(0)
     if values.size != math.prod(shape):
         raise CaptureError(
             f"'{source}' holds {values.size} numbers where its header says {math.prod(shape)}; it is damaged or cut "
@@ -192,6 +193,14 @@ def _text_blocks(data: bytes) -> Iterator[bytes]:
             end += 1
         yield data[start:end]
         start = end
+
+
+def _numbers(words: list[bytes], dtype: np.dtype) -> np.ndarray:
+    """Numbers in float64, but integers that it may round as what they are, if they are written as such."""
+    if dtype.kind in "ui" and dtype.itemsize == 8:
+        with suppress(ValueError, OverflowError):
+            return np.array([int(word) for word in words], dtype=dtype.newbyteorder("="))
+    return np.array(words, dtype=np.float64)
 
 
 def _joined(words: Sequence[float | str]) -> str:
