@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from difftetvr.capture.volumes.stored import require_memory
-from difftetvr.errors import CaptureError
+from difftetvr.errors import CaptureError, shown
 
 _SHORTEST_PRINTED = 60
 # Bytes of text that are parsed at once: as Python objects, numbers take ten times the room.
@@ -102,10 +102,10 @@ def parse_dtype(name: str, source: str | Path) -> np.dtype:
     """
     try:
         dtype = np.dtype(name)
-    except (TypeError, ValueError, SyntaxError):
+    except (TypeError, ValueError, SyntaxError, RuntimeError, OverflowError):
         dtype = np.dtype(object)
     if dtype.kind not in "uif" or dtype.itemsize > 8:
-        raise CaptureError(f"'{name}' for '{source}' is no number type; use uint8, uint16, int16, float32 or float64.")
+        raise CaptureError(f"{shown(name)} for '{source}' is no number type; use uint8, int16, uint16, float32, ....")
     return dtype
 
 
