@@ -152,6 +152,15 @@ def test_only_kernels_and_their_wrappers_touch_drjit():
     assert users <= MAY_TOUCH_DRJIT
 
 
+def test_no_test_module_is_imported():
+    """What several need stands beside them: as part of another module, tests would run where they are not meant to."""
+    for file in (ROOT / "tests").rglob("*.py"):
+        found = imported_modules(file, ["tests", file.stem])
+        parts = {part for name in found for part in name.split(".")}
+        modules = {path.stem for path in (ROOT / "tests").rglob("test_*.py")}
+        assert not parts & modules, f"{file} imports {sorted(parts & modules)}"
+
+
 def test_files_stay_short():
     scripts = [*(ROOT / "scripts").iterdir(), *(ROOT / "examples").glob("*.py"), *(ROOT / "benchmarks").glob("*.py")]
     files = [*SOURCES, *(ROOT / "tests").rglob("*.py"), *(file for file in scripts if file.is_file())]
