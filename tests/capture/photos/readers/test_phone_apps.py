@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from capture.photos.photo_checks import check_bounds, check_sentence, check_views
-from capture.photos.photo_scene import dump, write_polycam, write_record3d
+from capture.photos.photo_scene import FOCAL, HEIGHT, WIDTH, dump, write_polycam, write_record3d
 
 from difftetvr.capture import CaptureWarning, load_capture
 from difftetvr.errors import CaptureError
