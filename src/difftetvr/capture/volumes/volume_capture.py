@@ -17,7 +17,7 @@ from difftetvr.capture.volumes.value_range import range_text
 from difftetvr.capture.volumes.volume import Volume
 from difftetvr.capture.volumes.volume_renderer import Progress, VolumeRenderer
 from difftetvr.declared import require_declared
-from difftetvr.errors import CameraError, CaptureError, shown
+from difftetvr.errors import CameraError, CaptureError, counted, shown
 from difftetvr.optics.transfer_function import TransferFunction
 from difftetvr.rendering.cameras.pinhole import Camera
 from difftetvr.trust import require_free
@@ -27,6 +27,7 @@ _TOOTH_VOLUME = "tooth_103x94x161_uint8.raw.xz"
 _TOOTH_TRANSFER_FUNCTION = "tooth3gauss.json"
 # What would be stored as 0 in every picture of 8 bits.
 _LEAST_SEEN = 0.5 / 255.0
+_MOST = 2**31 - 1  # of what is counted
 # Colour and alpha as they are rendered, and once more apart from each other; a camera.
 _BYTES_PER_PIXEL, _BYTES_PER_VIEW = 32, 2000
 
@@ -137,10 +138,13 @@ class VolumeCapture:
             raise CaptureError(f"The views cannot be placed: {error}") from None
 
     def _require_memory(self) -> None:
+        for name in ("views", "width", "height"):
+            if (value := getattr(self, name)) > _MOST:
+                raise CaptureError(f"The {name} is {shown(value)}; it must be at most {_MOST}.")
         pixels = max(self.width, 0) * max(self.height, 0)
         require_free(
             max(self.views, 0) * (_BYTES_PER_VIEW + _BYTES_PER_PIXEL * pixels),
-            f"{shown(self.views)} views of {shown(self.width)} x {shown(self.height)} pixels",
+            f"{counted(self.views, 'view')} of {self.width:,} x {self.height:,} pixels",
             "ask for fewer or smaller ones with --views, --width and --height",
             CaptureError,
         )
