@@ -203,6 +203,8 @@ def _shortened(text: str) -> str:
 
 
 def _bytes(count: int) -> str:
+    if count >= 2**70:  # of any size, also such as no float holds
+        return "more than 1024 EiB"
     for unit, size in (("TiB", 2**40), ("GiB", 2**30), ("MiB", 2**20), ("KiB", 2**10)):
         if count >= size:
             return f"{count / size:.3g} {unit}"

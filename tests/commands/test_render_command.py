@@ -132,6 +132,46 @@ def test_an_uncertain_order_is_one_sentence(tmp_path, capsys):
     assert "autograd" not in printed.out + printed.err
 
 
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        (["--clip", 1, 0, 0, -5], "the clip plane cuts all of the mesh away; change --clip"),
+        (["--value-range", 10, 20], "the scalars, 0 to 1, all lie below the range 10 to 20"),
+        (["--eye", 3, 3, 3, "--target", 6, 6, 6], "the mesh lies behind the camera"),
+        (["--eye", 3, 0, 0, "--target", 2, 9, 0], "the camera looks past the mesh"),
+        (
+            ["--clip", 0, 0, 1, -0.9, "--eye", 0.5, -1, 0, "--target", 0.5, 0, 0, "--fov", 9],
+            "cuts away what the camera",
+        ),
+        (["--attenuation", 0], "the attenuation is 0; give a greater --attenuation"),
+        (["--attenuation", 1e-6], "lets all light through; raise its density"),
+        (["--transfer-function", "clear.json"], "the transfer function is transparent for the scalars, 0 to 1"),
+        (["--transfer-function", "black.json"], "has the colour of the background"),
+    ],
+)
+def test_a_picture_on_which_nothing_is_seen_is_said(simulation, tmp_path, capsys, monkeypatch, options, reason):
+    """One line beside the picture, which is written: a camera may be meant to look away."""
+    monkeypatch.chdir(tmp_path)
+    for name, opacity in (("clear", [0, 0]), ("black", [1, 1])):
+        dtv.TransferFunction([0, 1], opacity, [[0, 0, 0], [0, 0, 0]]).save(f"{name}.json")
+    picture = render(simulation, "-o", tmp_path / "a.png", "--scalar", "pressure", *options, *SMALL)
+    assert not picture.any()
+    said = " ".join(capsys.readouterr().out.split())
+    assert "The picture shows nothing: " in said and reason in said and "Wrote" in said
+
+
+def test_an_empty_model_is_said_and_a_dim_one_is_not(tmp_path, capsys):
+    from difftetvr.mesh.io import save
+
+    mesh = dtv.TetMesh.grid((1, 1, 1))
+    for density, is_said in ((0.0, True), (0.05, False)):
+        field = dtv.Field(torch.ones(8, 3), torch.full((8,), density))
+        save(tmp_path / "m.vtu", mesh, field)
+        for renderer in ("marching", "linked-list", "projected"):
+            render(tmp_path / "m.vtu", "-o", tmp_path / "a.png", "--renderer", renderer, *SMALL)
+            assert ("the density of the mesh is 0 everywhere" in capsys.readouterr().out) == is_said
+
+
 def test_bad_scalars(simulation, tmp_path, capsys):
     given = ["-o", tmp_path / "a.png", *SMALL]
     assert "pressure, velocity" in fails(capsys, "render", simulation, *given)

@@ -17,9 +17,7 @@ import SimpleITK
 import tifffile
 import torch
 from capture.photos import photo_scene
-from capture.photos.readers.test_nerf import write_tiny
-from capture.photos.readers.test_phone_apps import write_polycam, write_record3d
-from mesh.io import test_abaqus, test_exodus, test_xdmf
+from mesh.io import abaqus_files, exodus_files, xdmf_files
 
 import difftetvr as dtv
 from difftetvr.mesh import Field, TetMesh
@@ -200,16 +198,16 @@ def _meshes(folder: Path) -> list[Seed]:
         seeds += [Seed(kind, own, file.name, names, share / len(kinds)) for kind in kinds]
     own = folder / "mesh isolated"
     own.mkdir()
-    test_exodus.write(own / "a.exo")
-    test_exodus.write(own / "b.e", "NETCDF3_CLASSIC", old=True)
+    exodus_files.write(own / "a.exo")
+    exodus_files.write(own / "b.e", "NETCDF3_CLASSIC", old=True)
     (own / "a.xdmf").write_text(
-        f'<Xdmf Version="3.0"><Domain>{test_xdmf.SERIES["mesh in every step"]}</Domain></Xdmf>', encoding="utf-8"
+        f'<Xdmf Version="3.0"><Domain>{xdmf_files.SERIES["mesh in every step"]}</Domain></Xdmf>', encoding="utf-8"
     )
     seeds += [Seed("mesh", own, name, (name,), _ISOLATED) for name in ("a.exo", "b.e", "a.xdmf")]
     own = folder / "mesh abaqus"
     own.mkdir()
-    (own / "nodes.inp").write_text(test_abaqus.NODES)
-    (own / "a.inp").write_text("*INCLUDE, INPUT=nodes.inp\n" + test_abaqus.FIRST + test_abaqus.SECOND)
+    (own / "nodes.inp").write_text(abaqus_files.NODES)
+    (own / "a.inp").write_text("*INCLUDE, INPUT=nodes.inp\n" + abaqus_files.FIRST + abaqus_files.SECOND)
     return [*seeds, Seed("mesh", own, "a.inp", ("a.inp", "nodes.inp"))]
 
 
@@ -255,8 +253,8 @@ def _photos(folder: Path) -> list[Seed]:
         "cameras": photo_scene.write_camera_list,
         "colmap": photo_scene.write_colmap,
         "colmap text": lambda own: photo_scene.write_colmap(own, ".txt"),
-        "polycam": write_polycam,
-        "record3d": write_record3d,
+        "polycam": photo_scene.write_polycam,
+        "record3d": photo_scene.write_record3d,
     }
     seeds = []
     for name, write in writers.items():
@@ -273,7 +271,7 @@ def _photos(folder: Path) -> list[Seed]:
 def _saved(folder: Path) -> list[Seed]:
     own = folder / "saved"
     own.mkdir()
-    write_tiny(own / "tiny.npz")
+    photo_scene.write_tiny(own / "tiny.npz")
     dtv.load_capture(folder / "transforms").save(own / "saved.npz")
     return [Seed("capture", own, name, (name,), 2 * _PHOTOS) for name in ("tiny.npz", "saved.npz")]
 

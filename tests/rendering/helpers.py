@@ -108,3 +108,9 @@ def in_double(camera: Camera) -> Camera:
 def _gradient(leaf: Tensor) -> Tensor:
     assert leaf.grad is not None
     return leaf.grad
+
+
+def assert_sentence(error: BaseException) -> None:
+    """One line that ends in a full stop and is of a readable length."""
+    text = str(error)
+    assert text.endswith(".") and "\n" not in text and 20 < len(text) < 300, text

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import pytest
 import torch
 from oracle.scenes import SCENES
+from rendering.helpers import assert_sentence
 
 from difftetvr.errors import CameraError, DiffTetError, MeshError
 from difftetvr.mesh import Field, TetMesh
@@ -114,9 +115,3 @@ def test_positions_that_have_blown_up_end_in_an_error_or_an_image(inputs: Inputs
         assert_sentence(error)
     else:
         assert image.color.shape == (scene.camera.height, scene.camera.width, 3)
-
-
-def assert_sentence(error: BaseException) -> None:
-    """One line that ends in a full stop and is of a readable length."""
-    text = str(error)
-    assert text.endswith(".") and "\n" not in text and 20 < len(text) < 300, text

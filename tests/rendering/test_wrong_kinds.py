@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from rendering.test_errors import assert_sentence
+from rendering.helpers import assert_sentence
 
 from difftetvr.errors import CameraError, DiffTetError
 from difftetvr.mesh import Field, TetMesh

@@ -6,8 +6,9 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import cached_property
+from os import PathLike
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal
 
 import torch
 
@@ -15,7 +16,9 @@ from difftetvr.capture.capture_file import read_capture, write_capture
 from difftetvr.capture.free_space import FreeSpace
 from difftetvr.capture.hull import silhouettes
 from difftetvr.capture.packed import Images, Masks, MixedImages, PackedImages, shapes_of
+from difftetvr.declared import require_declared
 from difftetvr.errors import CaptureError, shown
+from difftetvr.inputs import as_number, as_reals, require_type
 from difftetvr.rendering.cameras.pinhole import Camera
 
 Encoding = Literal["linear", "srgb"]
@@ -70,10 +73,12 @@ class Capture:
     surroundings: float = 1.0
 
     def __post_init__(self) -> None:
+        require_declared(self, CaptureError, "capture's ", ("name", "encoding", "density_unit", "surroundings"))
         self._check_images()
         self._check_optional()
         self._check_cameras()
-        if self.test.shape != (len(self.cameras),) or self.test.dtype != torch.bool:
+        is_mask = isinstance(self.test, torch.Tensor)
+        if not is_mask or self.test.shape != (len(self.cameras),) or self.test.dtype != torch.bool:
             raise CaptureError(
                 f"The test mask of '{self.name}' must hold one bool for each of {len(self.cameras)} views."
             )
@@ -88,7 +93,9 @@ class Capture:
             self.density_unit = _DEFAULT_ATTENUATION / float((self.bounds[1] - self.bounds[0]).max())
 
     def _check_bounds(self) -> None:
-        self.bounds = torch.as_tensor(self.bounds, dtype=torch.float32)
+        advice = "give the lower and the upper corner"
+        bounds = as_reals(self.bounds, f"The box of bounds of '{self.name}'", CaptureError, advice=advice)
+        self.bounds = bounds.to("cpu", torch.float32)
         if self.bounds.shape != (2, 3) or not bool((self.bounds[0] < self.bounds[1]).all()):
             raise CaptureError(
                 f"The bounds of '{self.name}' must be a lower and, greater in all axes, an upper corner."
@@ -100,7 +107,14 @@ class Capture:
                 f"The surroundings of '{self.name}' are {shown(self.surroundings)}; they must be at least 1."
             )
 
+    def _as_views(self, name: str, values: Any) -> Images:
+        """Values of views on which to look, a tensor or packed."""
+        if not isinstance(values, PackedImages | MixedImages):
+            values = as_reals(values, f"The array of {name} of '{self.name}'", CaptureError, torch.float32)
+        return values
+
     def _check_images(self) -> None:
+        self.images = self._as_views("images", self.images)
         shapes = shapes_of(self.images)
         wrong = next((shape for shape in shapes or [()] if len(shape) != 3 or shape[2] != 3 or 0 in shape), None)
         if wrong is not None:
@@ -113,6 +127,7 @@ class Capture:
         )
         if self.alphas is None:
             return
+        self.alphas = self._as_views("alphas", self.alphas)
         self._check_shapes("alphas", self.alphas)
         self.alphas = self._checked(self.alphas, lambda v: ~((v >= 0) & (v <= 1)), "an alpha outside [0, 1]")
 
@@ -134,9 +149,9 @@ class Capture:
         )
 
     def _check_optional(self) -> None:
-        if self.encoding not in get_args(Encoding):
-            raise CaptureError(f"The encoding of '{self.name}' is '{self.encoding}'; it must be linear or srgb.")
         if self.valid is not None:
+            kinds = (torch.Tensor, MixedImages)
+            require_type(self.valid, kinds, f"The valid of '{self.name}'", "pass a tensor of bools", CaptureError)
             self._check_shapes("valid pixels", self.valid)
             parts = self.valid.data if isinstance(self.valid, MixedImages) else (self.valid,)
             if any(part.dtype != torch.bool for part in parts):
@@ -145,6 +160,7 @@ class Capture:
             values = getattr(self, name)
             if values is None:
                 continue
+            values = as_reals(values, f"The array of {name} of '{self.name}'", CaptureError)
             if values.ndim != 2 or values.shape[1] != 3 or not bool(torch.isfinite(values).all()):
                 raise CaptureError(f"The {name} of '{self.name}' must be (P, 3) finite numbers.")
             setattr(self, name, values.to("cpu", torch.float32))
@@ -168,6 +184,9 @@ class Capture:
             raise CaptureError(f"View {int(views.nonzero()[0])} of '{self.name}' has {what}; correct the image.")
 
     def _check_cameras(self) -> None:
+        is_list = isinstance(self.cameras, list | tuple)
+        if not is_list or not all(isinstance(camera, Camera) for camera in self.cameras):
+            raise CaptureError(f"The cameras of '{self.name}' are {shown(self.cameras)}; pass a list of Camera.")
         sizes = [(width, height) for height, width, _ in shapes_of(self.images)]
         if len(self.cameras) != len(sizes):
             raise CaptureError(
@@ -230,6 +249,7 @@ class Capture:
         Raises:
             CaptureError: The share is out of range.
         """
+        share = as_number(share, "The share", CaptureError)
         cameras = [self.cameras[view] for view in self.train_indices.tolist()]
         return FreeSpace.of(cameras, self.bounds, self.scene_points, share)
 
@@ -270,4 +290,5 @@ class Capture:
         Raises:
             CaptureError: The file is missing, damaged, or no capture.
         """
+        require_type(path, (str, PathLike), "The path of the capture", "give the name of a file", CaptureError)
         return Capture(**read_capture(path))

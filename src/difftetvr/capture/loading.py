@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from difftetvr.capture.photos.readers.foreign import known_export
 from difftetvr.capture.volumes.readers.table import KNOWN, is_volume_file
 from difftetvr.capture.volumes.volume_capture import TOOTH, VolumeCapture
 from difftetvr.errors import CaptureError
+from difftetvr.inputs import require_type
 
 
 def load_capture(source: str | Path, **overrides: Any) -> Capture:
@@ -27,6 +29,7 @@ def load_capture(source: str | Path, **overrides: Any) -> Capture:
     Raises:
         CaptureError: The source or an override is not known or not valid.
     """
+    require_type(source, (str, PathLike), "The source", "pass the path of a capture, or 'tooth'", CaptureError)
     chosen = {key: value for key, value in overrides.items() if value is not None}
     kind = _kind(source, chosen)
     if kind is None:

@@ -157,21 +157,19 @@ class Render:
         import torch
 
         from difftetvr.rendering import render
+        from difftetvr.view.blank import why_blank
         from difftetvr.view.pictures import save_png
 
         if shown.note is not None:
             console.print(shown.note)
-        mesh = shown.mesh.to(device=device)
+        mesh, content = shown.mesh.to(device=device), shown.field.to(device=device)
+        background, renderer = color_of(self.background), self._renderer_for(mesh, defects)
+        camera = self._camera(mesh)
         with torch.no_grad():
-            image = render(
-                mesh,
-                shown.field.to(device=device),
-                self._camera(mesh),
-                background=torch.tensor(color_of(self.background)),
-                renderer=self._renderer_for(mesh, defects),
-                clip_plane=self.clip,
-            )
+            image = render(mesh, content, camera, torch.tensor(background), renderer=renderer, clip_plane=self.clip)
         save_png(self.output, image.color)
+        if (reason := why_blank(mesh, content, camera, image, background, renderer, self.clip)) is not None:
+            console.print(reason, highlight=False)
         what = "" if shown.name is None else f", {shown.name}"
         console.print(f"Wrote {self.output} ({self.width} x {self.height}{what})", highlight=False)
 

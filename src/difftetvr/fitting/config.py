@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
+from difftetvr.declared import require_declared
 from difftetvr.errors import FitError
 from difftetvr.fitting.motion import Motion
 from difftetvr.fitting.options import LARGEST_COUNT, options_from_json, require
@@ -148,6 +149,7 @@ class FitConfig:
     """Options of --refine star."""
 
     def __post_init__(self) -> None:
+        require_declared(self, FitError, "option ")
         for name, (least, most) in _RANGES.items():
             value = getattr(self, name)
             require(value is None or least <= value <= most, name, value, f"at least {least} and at most {most}")

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import NoneType
 
 import torch
 
 from difftetvr.capture.capture import Capture
+from difftetvr.errors import FitError, shown
 from difftetvr.fitting.config import FitConfig
 from difftetvr.fitting.records.checkpoint import Checkpoint, alone_with, require_no_folder
 from difftetvr.fitting.records.evaluation import evaluate
 from difftetvr.fitting.records.result import FitResult, Progress
 from difftetvr.fitting.refinement import Strategy
 from difftetvr.fitting.trainer import Trainer
+from difftetvr.inputs import require_type
 from difftetvr.interrupts import InterruptFlag
 from difftetvr.mesh.tetmesh import TetMesh
 
@@ -55,6 +59,8 @@ def fit(
         MeshError: The file of the initial mesh cannot be read or holds an invalid mesh, or the grid is too large.
         KeyboardInterrupt: The run was interrupted; the checkpoint is saved.
     """
+    _require_kinds(capture, config, mesh, strategy, on_progress)
+    require_type(checkpoint, (str, os.PathLike, NoneType), "checkpoint", "pass the name of a file", FitError)
     path = Path(checkpoint) if checkpoint is not None else None
     with contextlib.nullcontext() if path is None else alone_with(path):
         trainer = prepare(
@@ -113,6 +119,17 @@ def optimise(
         field = trainer.parameters.detached_field()
         evaluation = evaluate(trainer.mesh, field, capture, held_out, config.evaluation_background())
     return FitResult(trainer.mesh, field, evaluation, trainer.history, config)
+
+
+def _require_kinds(capture: object, config: object, mesh: object, strategy: object, on_progress: object) -> None:
+    """Checks what callers of :func:`fit` pass, before anything is made of it."""
+    require_type(capture, Capture, "capture", "pass a difftetvr.Capture, such as of load_capture", FitError)
+    require_type(config, (FitConfig, NoneType), "config", "pass a difftetvr.FitConfig", FitError)
+    require_type(mesh, (TetMesh, NoneType), "mesh", "pass a difftetvr.TetMesh", FitError)
+    if strategy is not None and (isinstance(strategy, type) or not callable(getattr(strategy, "refine", None))):
+        raise FitError(f"strategy is {shown(strategy)}; pass one that refines, such as Exchange().")
+    if on_progress is not None and not callable(on_progress):
+        raise FitError(f"on_progress is {shown(on_progress)}; pass a function.")
 
 
 def _run(trainer: Trainer, path: Path | None, on_progress: Callable[[Progress], None] | None) -> None:

@@ -38,6 +38,7 @@ class VertexOptimizerConfig(OptionGroup):
     """What the guard lets no cell fall under."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for name in ("rate", "final_rate"):
             value = getattr(self, name)
             self._require(value > 0 and math.isfinite(value), name, "greater than 0 and finite")

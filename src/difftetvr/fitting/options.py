@@ -8,19 +8,14 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import json
 import reprlib
-import sys
-import types
-import typing
-from typing import Any, ClassVar, Literal, TypeVar
+from typing import Any, ClassVar, TypeVar
 
+from difftetvr.declared import as_declared, declared_types, in_words, require_declared
 from difftetvr.errors import FitError, shown
 
 LARGEST_COUNT = 2**31 - 1
 """Greatest value of options that count something."""
-
-_IN_WORDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a text", types.NoneType: "null"}
 
 _Options = TypeVar("_Options")
 
@@ -47,6 +42,9 @@ class OptionGroup:
 
     prefix: ClassVar[str] = ""
 
+    def __post_init__(self) -> None:
+        require_declared(self, FitError, f"option {self.prefix}")
+
     def _require(self, condition: bool, name: str, rule: str) -> None:
         require(condition, f"{self.prefix}{name}", getattr(self, name), rule)
 
@@ -69,7 +67,7 @@ def options_from_json(kind: type[_Options], values: object, path: str = "") -> _
     if not isinstance(values, dict):
         subject = f"The option {path} is" if path else "The options are"
         raise FitError(f'{subject} no JSON object; write {{"option": value, ...}}.')
-    declared = _declared(kind)
+    declared = declared_types(kind)
     options: dict[str, Any] = {}
     for name, value in values.items():
         full = f"{path}.{name}" if path else name
@@ -80,53 +78,16 @@ def options_from_json(kind: type[_Options], values: object, path: str = "") -> _
         if dataclasses.is_dataclass(declared[name]):
             options[name] = options_from_json(declared[name], value, full)
             continue
-        # Cut short: the value may be of any length and depth.
-        require(_fits(value, declared[name]), full, reprlib.repr(value), _in_words(declared[name]))
-        options[name] = tuple(value) if isinstance(value, list) else value
+        try:
+            options[name] = as_declared(value, declared[name])
+        except ValueError:
+            # Cut short: the value may be of any length and depth.
+            require(False, full, reprlib.repr(value), in_words(declared[name], is_json=True))
     for item in dataclasses.fields(kind):  # type: ignore[arg-type]
         if item.name not in options and not _has_default(item):
             raise FitError(f"The option '{item.name}' is missing{f' in {path}' if path else ''}; add it.")
     return kind(**options)
 
 
-def _declared(kind: Any) -> dict[str, Any]:
-    """Types of a dataclass's fields by name."""
-    hints = typing.get_type_hints(kind)
-    return {item.name: hints[item.name] for item in dataclasses.fields(kind)}
-
-
 def _has_default(item: dataclasses.Field[Any]) -> bool:
     return item.default is not dataclasses.MISSING or item.default_factory is not dataclasses.MISSING
-
-
-def _fits(value: object, declared: Any) -> bool:
-    """Whether a value belongs to a declared type; whole numbers are floats, too, but truth values are no numbers."""
-    origin, arguments = typing.get_origin(declared), typing.get_args(declared)
-    if origin in (typing.Union, types.UnionType):
-        return any(_fits(value, choice) for choice in arguments)
-    if origin is Literal:
-        return value in arguments
-    if origin is tuple:
-        return (
-            isinstance(value, list | tuple)
-            and len(value) == len(arguments)
-            and all(_fits(v, t) for v, t in zip(value, arguments, strict=True))
-        )
-    if isinstance(value, bool) and declared is not bool:
-        return False
-    if declared is float and isinstance(value, int):
-        # Those of JSON have no greatest value.
-        return abs(value) <= sys.float_info.max
-    return isinstance(value, declared)
-
-
-def _in_words(declared: Any) -> str:
-    """What a value of a declared type looks like in JSON."""
-    origin, arguments = typing.get_origin(declared), typing.get_args(declared)
-    if origin in (typing.Union, types.UnionType):
-        return " or ".join(_in_words(choice) for choice in arguments)
-    if origin is Literal:
-        return " or ".join(json.dumps(value) for value in arguments)
-    if origin is tuple:
-        return f"[{', '.join(_in_words(part) for part in arguments)}]"
-    return _IN_WORDS[declared]

@@ -1,3 +1,4 @@
+from . import blank as blank
 from . import compare as compare
 from . import cut as cut
 from . import describe as describe

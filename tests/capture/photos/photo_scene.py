@@ -165,3 +165,35 @@ def _write_text(sparse: Path, poses: list[np.ndarray], model: tuple[int, str], p
     points = "".join(f"{10 * i} {text(point)} 255 51 0 0.5 100 {i}\n" for i, point in enumerate(POINTS))
     for name, content in (("cameras", camera), ("images", images), ("points3D", points)):
         (sparse / f"{name}.txt").write_text(content)
+
+
+def write_tiny(path: Path, channels: int = 3) -> list[np.ndarray]:
+    poses = orbit()
+    images = np.stack([picture(pose) for pose in poses])[..., :channels]
+    np.savez(path, images=images / np.float32(255), poses=np.array([opengl(p) for p in poses]), focal=np.array(FOCAL))
+    return poses
+
+
+def write_polycam(folder: Path, prefix: str = "") -> list[np.ndarray]:
+    poses = orbit()
+    (folder / "keyframes" / f"{prefix}cameras").mkdir(parents=True)
+    for index, pose in enumerate(poses):
+        save(folder / "keyframes" / f"{prefix}images" / f"{100 + index}.png", picture(pose))
+        matrix = opengl(pose)
+        values = {f"t_{row}{column}": matrix[row][column] for row in range(3) for column in range(4)}
+        content = {**values, **CAMERA, "width": WIDTH, "height": HEIGHT, "blur_score": 90.0}
+        dump(folder / "keyframes" / f"{prefix}cameras" / f"{100 + index}.json", content)
+    return poses
+
+
+def write_record3d(folder: Path, **changes: object) -> list[np.ndarray]:
+    poses, rows = orbit(), []
+    for index, pose in enumerate(poses):
+        save(folder / "rgb" / f"{index}.png", picture(pose))
+        matrix = np.array(opengl(pose))
+        w, x, y, z = quaternion(matrix[:3, :3])
+        rows.append([x, y, z, w, *matrix[:3, 3]])
+    # Column by column.
+    k = [FOCAL, 0, 0, 0, FOCAL, 0, WIDTH / 2, HEIGHT / 2, 1]
+    dump(folder / "metadata.json", {"poses": rows, "K": k, "w": WIDTH, "h": HEIGHT, "fps": 60, **changes})
+    return poses

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tifffile
 import torch
 from capture.damage import damaged_copies
 from capture.photos.photo_checks import check_sentence
@@ -84,6 +85,55 @@ def test_kinds_of_images(tmp_path: Path) -> None:
     Image.fromarray(grey.astype(np.float32)).save(tmp_path / "float.tif")
     with pytest.raises(CaptureError, match="neither 8 nor plain 16 bits"):
         read_image(tmp_path / "float.tif")
+
+
+@pytest.mark.parametrize(
+    ("dtype", "words"),
+    [("float32", "floats of 32 bits"), ("float16", "floats of 16 bits"), ("uint32", "integers of 32 bits")],
+)
+def test_depths_that_are_not_read_are_no_damage(tmp_path: Path, dtype: str, words: str) -> None:
+    tifffile.imwrite(tmp_path / "a.tif", np.zeros((4, 5, 3), dtype), photometric="rgb")
+    for read in (image_header, read_image, lambda path: read_mask(path, (5, 4))):
+        with pytest.raises(
+            CaptureError, match=f"holds {words}, neither 8 nor plain 16 bits a channel; save it"
+        ) as error:
+            read(tmp_path / "a.tif")
+        check_sentence(error.value)
+    # A JPEG of 12 bits.
+    Image.fromarray(np.zeros((4, 5, 3), np.uint8)).save(tmp_path / "a.jpg")
+    (tmp_path / "a.jpg").write_bytes(
+        (tmp_path / "a.jpg").read_bytes().replace(b"\xff\xc0\0\x11\x08", b"\xff\xc0\0\x11\x0c")
+    )
+    with pytest.raises(CaptureError, match=r"holds what cannot be read \(cannot handle 12-bit layers\), neither 8"):
+        read_image(tmp_path / "a.jpg")
+
+
+def test_kinds_that_cameras_and_programs_write(tmp_path: Path) -> None:
+    """Of several pictures the first; colours of print and palettes with alpha become what they look like."""
+    color = np.full((6, 8, 3), (200, 100, 50), np.uint8)
+    image, other = Image.fromarray(color), Image.fromarray(255 - color)
+    several = {"save_all": True, "append_images": [other]}
+    turned = Image.Exif()
+    turned[274] = 6  # by a quarter, which is ignored, as the size shows
+    writes = {
+        "print.jpg": (image.convert("CMYK"), {"quality": 100}),
+        "fine.jpg": (image, {"quality": 100, "progressive": True}),
+        "phone.jpg": (image, {"quality": 100, "format": "MPO", **several}),
+        "turned.jpg": (image, {"quality": 100, "exif": turned}),
+        "moving.png": (image, several),
+        "moving.webp": (image, {"lossless": True, **several}),
+    }
+    for name, (picture_of, options) in writes.items():
+        picture_of.save(tmp_path / name, **options)
+        values = read_image(tmp_path / name)
+        assert values.shape == (6, 8, 3) and np.abs(values.numpy() - color / 255).max() < 0.01, name
+    clear = Image.fromarray(np.arange(48, dtype=np.uint8).reshape(6, 8) % 2, mode="P")
+    clear.putpalette([255, 0, 0, 0, 255, 0])
+    clear.save(tmp_path / "clear.png", transparency=bytes([0, 128]))
+    values = read_image(tmp_path / "clear.png").numpy()
+    assert np.array_equal(values[0, 0], (0, 0, 0, 0)) and np.allclose(values[0, 1], (0, 128 / 255, 0, 128 / 255))
+    Image.fromarray(color[..., 0] > 100).save(tmp_path / "bits.png")
+    assert float(read_image(tmp_path / "bits.png").min()) == 1.0
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tif"])

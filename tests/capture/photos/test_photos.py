@@ -129,7 +129,7 @@ def test_formats_are_found_by_looking_and_can_be_forced(tmp_path: Path) -> None:
         ({"format": "transforms"}, "Cannot read"),
         ({"format": "colmap"}, "no sparse model"),
         ({"format": "tiny-nerf"}, "Cannot read"),
-        ({"format": "video"}, "format is 'video'; it must be one of"),
+        ({"format": "video"}, "format is 'video'; it must be nerf-synthetic, "),
     ):
         with pytest.raises(CaptureError, match=message) as error:
             load_capture(tmp_path / "empty", **options)

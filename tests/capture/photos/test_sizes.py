@@ -37,6 +37,7 @@ from difftetvr.capture import (
     load_capture,
 )
 from difftetvr.errors import CaptureError
+from difftetvr.fitting.refinement import Exchange
 
 PORTRAIT = (30, 44)  # width and height
 
@@ -181,7 +182,10 @@ def test_a_refined_fit_and_its_pictures(tmp_path: Path) -> None:
 
     write_mixed(tmp_path, count=9, opaque=True)
     capture = load_capture(tmp_path, bounds=(-0.5, -1.0, -0.7, 1.1, 0.6, 0.9))
-    result = dtv.fit(capture, dtv.FitConfig(iterations=12, cells=600, harmonics=0, device="cpu"))
+    refined = Exchange(rounds=3, views=3)
+    config = dtv.FitConfig(iterations=12, cells=400, harmonics=0, device="cpu", exchange=refined)
+    result = dtv.fit(capture, config)
+    assert len(result.history.refinements) == 3
     assert result.history.loss[-1] < result.history.loss[0]
     folder = RunFolder(tmp_path / "out")
     folder.path.mkdir()

@@ -71,6 +71,41 @@ def test_small_differences_far_from_zero_survive(tmp_path: Path) -> None:
     np.testing.assert_allclose(load(saved(tmp_path, values))[0].values, ramp(0, 1, "float64"), atol=1e-7)
 
 
+@pytest.mark.parametrize(
+    "dtype, offset", [("int64", 1_700_000_000_000_000_000), ("int64", -(2**63)), ("uint64", 2**63)]
+)
+def test_integers_that_float64_would_round(tmp_path: Path, dtype: str, offset: int) -> None:
+    """Of times in nanoseconds, float64 knows every 256th only."""
+    steps = np.random.default_rng(0).permutation(24).reshape(2, 3, 4)
+    values = np.array([offset + int(step) for step in steps.ravel()], dtype).reshape(steps.shape)
+    volume, said = load(saved(tmp_path, values))
+    assert np.array_equal(volume.values, (steps / 23).astype(np.float32))
+    assert (
+        volume.value_range == (offset, offset + 23) and f"values {offset} to {offset + 23} stand for 0 to 1" in said[0]
+    )
+    assert summarise(tmp_path / "v.npy").ends == (offset, offset + 23)
+    # Ends that are given as whole numbers are not rounded, either.
+    volume, said = load(tmp_path / "v.npy", value_range=(offset + 3, offset + 13))
+    np.testing.assert_allclose(volume.values, np.clip((steps - 3) / 10, 0, 1), atol=1e-7)
+    assert "13 of 24 values" in said[0]
+    head = f"NRRD0004\ntype: {dtype}\ndimension: 3\nsizes: 4 3 2\nencoding: text\n\n"
+    (tmp_path / "v.nrrd").write_text(head + " ".join(map(str, values.ravel().tolist())))
+    assert np.array_equal(load(tmp_path / "v.nrrd")[0].values, (steps / 23).astype(np.float32))
+
+
+def test_all_of_64_bits(tmp_path: Path) -> None:
+    values = np.array([-(2**63), -1, 0, 1, 2**62, 2**63 - 1, 5, 7], np.int64).reshape(2, 2, 2)
+    exact = (values.astype(np.float64) + 2.0**63) / 2.0**64
+    np.testing.assert_allclose(load(saved(tmp_path, values))[0].values, exact, atol=1e-7)
+    volume, said = load(tmp_path / "v.npy", value_range=(0.5, 5.5))
+    np.testing.assert_allclose(volume.values, np.clip((values - 0.5) / 5, 0, 1), atol=1e-7)
+    assert "6 of 8 values" in said[0]
+    # Ends beyond what the type can hold.
+    np.testing.assert_allclose(
+        load(tmp_path / "v.npy", value_range=(-(2.0**64), 2**64))[0].values, exact / 2 + 0.25, atol=1e-7
+    )
+
+
 def test_ranges_at_the_end_of_float64(tmp_path: Path) -> None:
     values = ramp(-1.7, 1.7, "float64") * 1e308
     np.testing.assert_allclose(load(saved(tmp_path, values))[0].values, ramp(0, 1, "float64"), atol=1e-6)

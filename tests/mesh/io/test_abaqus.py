@@ -2,14 +2,11 @@
 
 import numpy as np
 import pytest
+from mesh.io.abaqus_files import FIRST, NODES, SECOND
 
 import difftetvr as dtv
 from difftetvr.errors import MeshError
 from difftetvr.mesh.io import load_data
-
-NODES = "*NODE, NSET=ALL\n1, 0., 0, 0\n2, 1, 0, 0\n3, 0, 1, 0\n4, 0, 0, 1\n70, 1, 1, 1,\n"
-FIRST = "*ELEMENT, TYPE=C3D4, ELSET=BONE\n1, 1,2,3,4\n"
-SECOND = "*Element, elset=skin , type=c3d4h\n2, 2, 3,\n4, 70\n*ELSET, ELSET=other, GENERATE\n1, 2, 1\n"
 
 
 def test_sets_types_and_rows_that_go_on(tmp_path):

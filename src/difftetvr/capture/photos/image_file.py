@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 import zlib
 from collections.abc import Callable, Iterator
@@ -16,7 +17,7 @@ from PIL import Image, ImageFile, UnidentifiedImageError
 from PIL.BmpImagePlugin import BmpImageFile
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
-from PIL.TiffImagePlugin import TiffImageFile
+from PIL.TiffImagePlugin import BITSPERSAMPLE, SAMPLEFORMAT, ImageFileDirectory_v2, TiffImageFile
 from PIL.WebPImagePlugin import WebPImageFile
 
 from difftetvr.errors import CaptureError
@@ -34,6 +35,9 @@ _BYTES, _BYTES_OF_DECODERS = 4, {"WEBP": 16, "TIFF": 12}
 _BYTES_OF_COEFFICIENTS = 6  # which progressive JPEG files need in full, however small they are decoded
 _BAND_PIXELS = 2**22
 _MOST_16_BITS = 65535.0
+# What Pillow says of intact files that it does not know how to read.
+_UNSUPPORTED = re.compile("unknown (pixel mode|data organization)|cannot handle|[Uu]nsupported|not available")
+_SAMPLE_FORMATS = {1: "integers", 2: "signed integers", 3: "floats"}
 
 
 @dataclass(frozen=True)
@@ -214,13 +218,37 @@ def _opened(path: Path) -> Iterator[Image.Image]:
             yield image
     except UnidentifiedImageError:
         raise CaptureError(f"'{path}' is no image that can be read; save it as PNG or JPEG.") from None
-    except OSError as error:
+    except (OSError, SyntaxError) as error:
+        if isinstance(error, SyntaxError) or _UNSUPPORTED.search(str(error)):
+            raise _unreadable(path, str(error)) from None
         reason = (error.strerror or str(error)).rstrip(".")
         raise CaptureError(f"Cannot read the image '{path}': {reason}; get the file anew.") from None
     except MemoryError:
         raise CaptureError(f"There is not enough memory for the image '{path}'; make it smaller.") from None
-    except (ValueError, SyntaxError, EOFError, IndexError, KeyError, TypeError, struct.error, zlib.error):
+    except (ValueError, EOFError, IndexError, KeyError, TypeError, struct.error, zlib.error):
         raise CaptureError(f"The image '{path}' is damaged; get the file anew.") from None
+
+
+def _unreadable(path: Path, reason: str) -> CaptureError:
+    """What to say of a file that Pillow does not open: that of a kind it does not know is not damaged."""
+    if not _UNSUPPORTED.search(reason):
+        return CaptureError(f"The image '{path}' is damaged; get the file anew.")
+    kind = _tiff_samples(path) or f"what cannot be read ({reason[:60].rstrip('.')})"
+    return CaptureError(f"'{path}' holds {kind}, neither 8 nor plain 16 bits a channel; save it with 8 bits.")
+
+
+def _tiff_samples(path: Path) -> str | None:
+    """Kind and depth of the channels of a TIFF file in words; None of others."""
+    try:
+        with path.open("rb") as file:
+            directory = ImageFileDirectory_v2(file.read(8))
+            file.seek(directory.next)
+            directory.load(file)
+            bits, (kind, *_) = directory[BITSPERSAMPLE], directory.get(SAMPLEFORMAT, (1,))
+            return f"{_SAMPLE_FORMATS.get(kind, 'samples')} of {max(bits)} bits"
+    # Whatever is wrong with it has been found before.
+    except (OSError, SyntaxError, ValueError, KeyError, TypeError, struct.error):
+        return None
 
 
 def _identified(file: Any, path: Path) -> Image.Image:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 import torch
@@ -22,9 +23,12 @@ from difftetvr.capture.photos.readers.phone_apps import is_polycam, is_record3d,
 from difftetvr.capture.photos.readers.tiny_nerf import is_tiny_nerf, read_tiny_nerf
 from difftetvr.capture.photos.readers.transforms import read_nerf_synthetic, read_transforms
 from difftetvr.capture.volumes.readers.table import is_volume_file
-from difftetvr.errors import CaptureError
+from difftetvr.declared import require_declared
+from difftetvr.errors import CaptureError, shown
+from difftetvr.inputs import as_whole
 from difftetvr.rendering.cameras.pinhole import Camera
 
+Corner = tuple[float, float, float]
 PhotoFormat = Literal["nerf-synthetic", "transforms", "colmap", "cameras", "tiny-nerf", "polycam", "record3d"]
 
 _READERS = {
@@ -50,15 +54,18 @@ class PhotoCapture:
         downscale: Pixels of an image along x and y that are averaged to one.
         test_every: One of so many views, by name, is held out, beginning with the first; 0 holds out none. None stands
             for 8 where the format does not say itself which views are held out.
-        bounds: Lower and upper corner of the box to reconstruct, (x, y, z, x, y, z); None finds it by the images'
-            alpha, the sparse points or the cameras.
+        bounds: Lower and upper corner of the box to reconstruct, (x, y, z, x, y, z) or one after the other; None finds
+            it by the images' alpha, the sparse points or the cameras.
     """
 
     path: str
     format: PhotoFormat | None = None
     downscale: int = 1
     test_every: int | None = None
-    bounds: tuple[float, float, float, float, float, float] | None = None
+    bounds: tuple[float, float, float, float, float, float] | tuple[Corner, Corner] | None = None
+
+    def __post_init__(self) -> None:
+        require_declared(self, CaptureError)
 
     def fitting_downscale(self, longest_side: int) -> int:
         """The least ``downscale`` with which images have at most so many pixels along their longer side, or nearly so.
@@ -70,10 +77,13 @@ class PhotoCapture:
             CaptureError: There is no such capture, or its first image cannot be read.
         """
         self._check()
+        most = as_whole(longest_side, "The longest_side", CaptureError)
+        if most < 1:
+            raise CaptureError(f"The longest_side is {shown(most)}; it must be at least 1.")
         path = Path(self.path)
         kind = self.format or find_format(path)
         # Archives of tiny NeRFs are tiny.
-        return 1 if kind == "tiny-nerf" else fitting_downscale(self._read(kind, path), longest_side)
+        return 1 if kind == "tiny-nerf" else fitting_downscale(self._read(kind, path), most)
 
     def build(self) -> Capture:
         """Read cameras and images.
@@ -108,7 +118,7 @@ class PhotoCapture:
 
     @staticmethod
     def _read(kind: PhotoFormat, path: Path) -> PhotoSet:
-        if not path.exists():
+        if not os.path.exists(path):
             raise CaptureError(f"There is no '{path}'; check the path of the capture.")
         return _READERS[kind](path)
 
@@ -132,14 +142,12 @@ class PhotoCapture:
         )
 
     def _check(self) -> None:
-        if self.format is not None and self.format not in get_args(PhotoFormat):
-            raise CaptureError(f"The format is '{self.format}'; it must be one of {', '.join(get_args(PhotoFormat))}.")
         if not 1 <= self.downscale <= _MOST_DOWNSCALE:
             raise CaptureError(
-                f"The downscale is {self.downscale}; it must be at least 1 and at most {_MOST_DOWNSCALE}."
+                f"The downscale is {shown(self.downscale)}; it must be at least 1 and at most {_MOST_DOWNSCALE}."
             )
         if self.test_every is not None and (self.test_every < 0 or self.test_every == 1):
-            raise CaptureError(f"The test_every is {self.test_every}; it must be 0 or at least 2.")
+            raise CaptureError(f"The test_every is {shown(self.test_every)}; it must be 0 or at least 2.")
 
     def _test_mask(self, given: torch.Tensor | None, count: int, name: str) -> torch.Tensor:
         if given is not None:
@@ -147,7 +155,7 @@ class PhotoCapture:
                 raise CaptureError(f"'{name}' says itself which views are held out; leave out test_every.")
             return given
         every = _TEST_EVERY if self.test_every is None else self.test_every
-        return torch.arange(count) % every == 0 if every else torch.zeros(count, dtype=torch.bool)
+        return torch.tensor([every > 0 and index % every == 0 for index in range(count)], dtype=torch.bool)
 
     def _find_bounds(
         self,
@@ -191,9 +199,9 @@ def is_photo_source(source: str | Path) -> bool:
     """
     path = Path(source)
     suffix = path.suffix.lower()
-    if path.is_dir():
+    if os.path.isdir(path):
         return not is_volume_file(path)
-    return path.is_file() and (suffix == ".json" or (suffix == ".npz" and is_tiny_nerf(path)))
+    return os.path.isfile(path) and (suffix == ".json" or (suffix == ".npz" and is_tiny_nerf(path)))
 
 
 def find_format(path: Path) -> PhotoFormat:
@@ -202,7 +210,7 @@ def find_format(path: Path) -> PhotoFormat:
     Raises:
         CaptureError: None that is known.
     """
-    if path.is_dir():
+    if os.path.isdir(path):
         if (path / "transforms_train.json").is_file():
             return "nerf-synthetic"
         if (path / "transforms.json").is_file():
@@ -229,7 +237,7 @@ def find_format(path: Path) -> PhotoFormat:
 
 def _is_camera_list(path: Path) -> bool:
     try:
-        return path.is_file() and read_json(path).get("format") == CAMERAS_FORMAT
+        return os.path.isfile(path) and read_json(path).get("format") == CAMERAS_FORMAT
     except CaptureError:
         return False
 

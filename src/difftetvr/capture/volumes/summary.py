@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from difftetvr.capture.volumes.value_range import checked_range, finite_values
+from difftetvr.capture.volumes.value_range import checked_range, ends_of, finite_values
 from difftetvr.capture.volumes.volume import load_raw
 from difftetvr.capture.volumes.volume_file import parse_spacing
 from difftetvr.errors import CaptureWarning
@@ -69,13 +69,13 @@ def summarise(
     for note in raw.notes:
         warnings.warn(note, CaptureWarning, stacklevel=2)
     values = finite_values(raw.values)
-    ends = (float(values.min()), float(values.max())) if values.size else None
+    ends = ends_of(raw.values)
     sample = values[:: max(1, -(-values.size // _MOST_SORTED))].astype(np.float64)
     stands: tuple[float, float] | None
     if value_range is not None:
         stands = checked_range(value_range)
     elif raw.values.dtype == np.uint8:
-        stands = (0.0, 255.0)
+        stands = (0, 255)
     else:
         stands = ends if ends is not None and ends[0] < ends[1] else None
     nz, ny, nx = raw.values.shape

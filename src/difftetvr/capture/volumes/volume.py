@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+import os
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,7 +18,9 @@ from difftetvr.capture.volumes.readers.table import is_volume_file as is_volume_
 from difftetvr.capture.volumes.readers.table import read_volume
 from difftetvr.capture.volumes.value_range import normalise
 from difftetvr.capture.volumes.volume_file import RawVolume
-from difftetvr.errors import CaptureError, CaptureWarning
+from difftetvr.declared import require_declared, require_value
+from difftetvr.errors import CaptureError, CaptureWarning, shown
+from difftetvr.inputs import require_type
 
 # Samples are indexed with 32 bits in records of four values.
 MAX_SAMPLES = 2**30
@@ -45,7 +49,8 @@ class Volume:
     value_range: tuple[float, float] = (0.0, 1.0)
 
     def __post_init__(self) -> None:
-        values = np.ascontiguousarray(self.values, dtype=np.float32)
+        require_declared(self, CaptureError, "volume's ", ("spacing", "name", "value_range"))
+        values = _numbers(self.values, self.name)
         object.__setattr__(self, "values", values)
         if values.ndim != 3 or min(values.shape) < 2:
             raise CaptureError(
@@ -110,6 +115,8 @@ class Volume:
             CaptureWarning: The range was taken from the values, values are clamped or not a number, or a reader had to
                 choose; once for each.
         """
+        if spacing is not None:
+            spacing = require_value(spacing, tuple[float, float, float], "spacing", CaptureError)
         try:
             raw = load_raw(path, shape, dtype)
             scalars, ends, notes = normalise(raw.values, value_range, path)
@@ -117,8 +124,21 @@ class Volume:
             raise CaptureError(f"The volume '{path}' needs more memory than there is; crop or shrink it.") from error
         for note in (*raw.notes, *notes):
             warnings.warn(note, CaptureWarning, stacklevel=2)
-        chosen = raw.spacing if spacing is None else tuple(float(s) for s in spacing)
+        chosen = raw.spacing if spacing is None else spacing
         return Volume(scalars, chosen, Path(path).name, ends)  # type: ignore[arg-type]
+
+
+def _numbers(values: Any, name: str) -> np.ndarray:
+    """Values as a contiguous array of float32."""
+    try:
+        array = np.asarray(values)
+        if array.dtype.kind not in "buif":
+            raise TypeError
+        return np.ascontiguousarray(array, dtype=np.float32)
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        raise CaptureError(
+            f"The values of the volume '{name}' are {shown(values)}; pass an array (nz, ny, nx) of numbers."
+        ) from None
 
 
 def load_raw(path: str | Path, shape: Sequence[int] | None, dtype: str | None) -> RawVolume:
@@ -127,6 +147,9 @@ def load_raw(path: str | Path, shape: Sequence[int] | None, dtype: str | None) -
     Raises:
         CaptureError: As for `Volume.load`.
     """
+    require_type(path, (str, os.PathLike), "The path of the volume", "give the name of a file or folder", CaptureError)
+    if shape is not None:
+        shape = require_value(shape, tuple[int, int, int], "shape", CaptureError)
     raw = in_world_axes(read_volume(Path(path), shape, dtype), path)
     if raw.values.size > MAX_SAMPLES:
         raise CaptureError(f"'{path}' has {raw.values.size} samples, more than {MAX_SAMPLES}; crop or shrink it.")

@@ -16,6 +16,7 @@ from difftetvr.capture.orbit import DEFAULT_FOV_Y, fibonacci_orbit, random_orbit
 from difftetvr.capture.volumes.value_range import range_text
 from difftetvr.capture.volumes.volume import Volume
 from difftetvr.capture.volumes.volume_renderer import Progress, VolumeRenderer
+from difftetvr.declared import require_declared
 from difftetvr.errors import CameraError, CaptureError, counted, shown
 from difftetvr.optics.transfer_function import TransferFunction
 from difftetvr.rendering.cameras.pinhole import Camera
@@ -26,6 +27,7 @@ _TOOTH_VOLUME = "tooth_103x94x161_uint8.raw.xz"
 _TOOTH_TRANSFER_FUNCTION = "tooth3gauss.json"
 # What would be stored as 0 in every picture of 8 bits.
 _LEAST_SEEN = 0.5 / 255.0
+_MOST = 2**31 - 1  # of what is counted
 # Colour and alpha as they are rendered, and once more apart from each other; a camera.
 _BYTES_PER_PIXEL, _BYTES_PER_VIEW = 32, 2000
 
@@ -72,6 +74,9 @@ class VolumeCapture:
     seed: int = 0
     orbit: Literal["fibonacci", "random"] = "fibonacci"
     value_range: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        require_declared(self, CaptureError)
 
     def build(self, progress: Progress | None = None, device: str | torch.device | None = None) -> Capture:
         """Read the volume, place the cameras and render the views.
@@ -128,13 +133,14 @@ class VolumeCapture:
         try:
             if self.orbit == "fibonacci":
                 return fibonacci_orbit(self.views, center, self.radius, self.fov_y, self.width, self.height)
-            if self.orbit == "random":
-                return random_orbit(self.views, center, self.radius, self.fov_y, self.width, self.height, self.seed)
+            return random_orbit(self.views, center, self.radius, self.fov_y, self.width, self.height, self.seed)
         except CameraError as error:
             raise CaptureError(f"The views cannot be placed: {error}") from None
-        raise CaptureError(f"The orbit is '{self.orbit}'; it must be fibonacci or random.")
 
     def _require_memory(self) -> None:
+        for name in ("views", "width", "height"):
+            if (value := getattr(self, name)) > _MOST:
+                raise CaptureError(f"The {name} is {shown(value)}; it must be at most {_MOST}.")
         pixels = max(self.width, 0) * max(self.height, 0)
         require_free(
             max(self.views, 0) * (_BYTES_PER_VIEW + _BYTES_PER_PIXEL * pixels),
@@ -148,10 +154,11 @@ class VolumeCapture:
             return torch.zeros(max(self.views, 0), dtype=torch.bool)
         if self.test_every < 2 or not 0 <= self.test_offset < self.test_every:
             raise CaptureError(
-                f"Every {self.test_every}th view from {self.test_offset} cannot be held out; test_every must be 0 or "
-                "at least 2, and test_offset at least 0 and less than test_every."
+                f"Every {shown(self.test_every)}th view from {shown(self.test_offset)} cannot be held out; test_every "
+                "must be 0 or at least 2, and test_offset at least 0 and less than test_every."
             )
-        return torch.arange(max(self.views, 0)) % self.test_every == self.test_offset
+        held_out = [view % self.test_every == self.test_offset for view in range(max(self.views, 0))]
+        return torch.tensor(held_out, dtype=torch.bool)
 
 
 @contextmanager

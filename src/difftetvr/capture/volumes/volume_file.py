@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from difftetvr.errors import CaptureError
+from difftetvr.capture.volumes.stored import require_memory
+from difftetvr.errors import CaptureError, shown
 
 _SHORTEST_PRINTED = 60
 # Bytes of text that are parsed at once: as Python objects, numbers take ten times the room.
@@ -100,10 +102,10 @@ def parse_dtype(name: str, source: str | Path) -> np.dtype:
     """
     try:
         dtype = np.dtype(name)
-    except (TypeError, ValueError, SyntaxError):
+    except (TypeError, ValueError, SyntaxError, RuntimeError, OverflowError):
         dtype = np.dtype(object)
     if dtype.kind not in "uif" or dtype.itemsize > 8:
-        raise CaptureError(f"'{name}' for '{source}' is no number type; use uint8, uint16, int16, float32 or float64.")
+        raise CaptureError(f"{shown(name)} for '{source}' is no number type; use uint8, int16, uint16, float32, ....")
     return dtype
 
 
@@ -120,10 +122,10 @@ def text_to_volume(text: str | bytes, shape: tuple[int, int, int], dtype: np.dty
     """
     data = text.encode() if isinstance(text, str) else text
     try:
-        blocks = [np.array(block.split(), dtype=np.float64) for block in _text_blocks(data)]
+        blocks = [_numbers(block.split(), dtype) for block in _text_blocks(data)]
     except ValueError:
         raise CaptureError(f"The text in '{source}' holds something else than numbers; get the file anew.") from None
-    values = np.concatenate([np.empty(0), *blocks])
+    values = np.concatenate(blocks) if blocks else np.empty(0)
     if values.size != math.prod(shape):
         raise CaptureError(
             f"'{source}' holds {values.size} numbers where its header says {math.prod(shape)}; it is damaged or cut "
@@ -154,6 +156,19 @@ def to_volume(data: bytes, shape: tuple[int, int, int], dtype: np.dtype, source:
     return values.astype(dtype.newbyteorder("="), copy=False)
 
 
+def scaled(values: np.ndarray, slope: float, offset: float, source: Path) -> np.ndarray:
+    """What stored values stand for, slope times each plus offset, in float64; as they are where that changes nothing.
+
+    Raises:
+        CaptureError: There is not enough memory.
+    """
+    if (slope, offset) == (1.0, 0.0):
+        return values
+    require_memory(source, 8 * values.size)
+    with np.errstate(over="ignore"):
+        return values * np.float64(slope) + np.float64(offset)
+
+
 def three_axes(shape: Sequence[int], source: str | Path) -> tuple[int, int, int]:
     """The shape of an array, if it is that of a volume of scalars.
 
@@ -178,6 +193,14 @@ def _text_blocks(data: bytes) -> Iterator[bytes]:
             end += 1
         yield data[start:end]
         start = end
+
+
+def _numbers(words: list[bytes], dtype: np.dtype) -> np.ndarray:
+    """Numbers in float64, but integers that it may round as what they are, if they are written as such."""
+    if dtype.kind in "ui" and dtype.itemsize == 8:
+        with suppress(ValueError, OverflowError):
+            return np.array([int(word) for word in words], dtype=dtype.newbyteorder("="))
+    return np.array(words, dtype=np.float64)
 
 
 def _joined(words: Sequence[float | str]) -> str:

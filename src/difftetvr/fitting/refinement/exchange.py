@@ -44,6 +44,7 @@ class Exchange(OptionGroup):
     --motion.boundary to say."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for name in ("rounds", "views"):
             value = getattr(self, name)
             valid = value is None or 1 <= value <= LARGEST_COUNT

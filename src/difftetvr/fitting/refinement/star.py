@@ -39,6 +39,7 @@ class Star(OptionGroup):
     """Share of the run after which the mesh is not subdivided any more."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         self._require(1 <= self.views <= LARGEST_COUNT, "views", f"at least 1 and at most {LARGEST_COUNT}")
         self._require(0 <= self.until <= 1, "until", "between 0 and 1")
         for name in ("share", "initial"):

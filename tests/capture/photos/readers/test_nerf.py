@@ -11,7 +11,17 @@ import pytest
 import torch
 from capture.damage import damaged_copies
 from capture.photos.photo_checks import check_bounds, check_sentence, check_views
-from capture.photos.photo_scene import FOCAL, HEIGHT, WIDTH, dump, opengl, orbit, picture, save, write_nerf_synthetic
+from capture.photos.photo_scene import (
+    FOCAL,
+    HEIGHT,
+    WIDTH,
+    dump,
+    orbit,
+    picture,
+    save,
+    write_nerf_synthetic,
+    write_tiny,
+)
 
 from difftetvr import trusting
 from difftetvr.capture import CaptureWarning, PackedImages, load_capture
@@ -119,13 +129,6 @@ def test_silhouettes_that_do_not_meet(tmp_path: Path) -> None:
     with pytest.raises(CaptureError, match=r"do not meet|see nothing") as error:
         load_capture(tmp_path)
     check_sentence(error.value)
-
-
-def write_tiny(path: Path, channels: int = 3) -> list[np.ndarray]:
-    poses = orbit()
-    images = np.stack([picture(pose) for pose in poses])[..., :channels]
-    np.savez(path, images=images / np.float32(255), poses=np.array([opengl(p) for p in poses]), focal=np.array(FOCAL))
-    return poses
 
 
 @pytest.mark.parametrize("channels", [3, 4])

@@ -5,38 +5,12 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 from capture.photos.photo_checks import check_bounds, check_sentence, check_views
-from capture.photos.photo_scene import CAMERA, FOCAL, HEIGHT, WIDTH, dump, opengl, orbit, picture, quaternion, save
+from capture.photos.photo_scene import FOCAL, HEIGHT, WIDTH, dump, write_polycam, write_record3d
 
 from difftetvr.capture import CaptureWarning, load_capture
 from difftetvr.errors import CaptureError
-
-
-def write_polycam(folder: Path, prefix: str = "") -> list[np.ndarray]:
-    poses = orbit()
-    (folder / "keyframes" / f"{prefix}cameras").mkdir(parents=True)
-    for index, pose in enumerate(poses):
-        save(folder / "keyframes" / f"{prefix}images" / f"{100 + index}.png", picture(pose))
-        matrix = opengl(pose)
-        values = {f"t_{row}{column}": matrix[row][column] for row in range(3) for column in range(4)}
-        content = {**values, **CAMERA, "width": WIDTH, "height": HEIGHT, "blur_score": 90.0}
-        dump(folder / "keyframes" / f"{prefix}cameras" / f"{100 + index}.json", content)
-    return poses
-
-
-def write_record3d(folder: Path, **changes: object) -> list[np.ndarray]:
-    poses, rows = orbit(), []
-    for index, pose in enumerate(poses):
-        save(folder / "rgb" / f"{index}.png", picture(pose))
-        matrix = np.array(opengl(pose))
-        w, x, y, z = quaternion(matrix[:3, :3])
-        rows.append([x, y, z, w, *matrix[:3, 3]])
-    # Column by column.
-    k = [FOCAL, 0, 0, 0, FOCAL, 0, WIDTH / 2, HEIGHT / 2, 1]
-    dump(folder / "metadata.json", {"poses": rows, "K": k, "w": WIDTH, "h": HEIGHT, "fps": 60, **changes})
-    return poses
 
 
 @pytest.mark.parametrize("prefix", ["", "corrected_"])

@@ -55,7 +55,7 @@ def known_export(path: Path) -> str | None:
 
 
 def _candidates(path: Path) -> Iterator[Path]:
-    if not path.is_dir():
+    if not os.path.isdir(path):
         yield path
         return
     suffixes = {suffix for suffix, *_ in _EXPORTS}

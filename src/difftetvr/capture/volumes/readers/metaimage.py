@@ -20,6 +20,7 @@ from difftetvr.capture.volumes.volume_file import (
     parse_numbers,
     parse_shape,
     parse_steps,
+    scaled,
     text_to_volume,
     to_volume,
 )
@@ -68,13 +69,14 @@ def read_metaimage(path: Path) -> RawVolume:
         )
     shape = parse_shape(sizes, path)
     spacing, directions = parse_steps(_steps(fields), path)
+    scale = _scale(path, fields)
     parts = _parts(path, fields, listed, header_size, shape)
     if _is_true(fields, "binarydata", default="true"):
         values = to_volume(read_parts(parts, byte_count(shape, dtype), path), shape, dtype, path)
     else:
         text = b"\n".join(part.read_text(math.prod(shape) // len(parts)) for part in parts)
         values = text_to_volume(text, shape, dtype, path)
-    return RawVolume(values, spacing, directions)
+    return RawVolume(scaled(values, *scale, path), spacing, directions)
 
 
 def _read_header(path: Path) -> tuple[dict[str, str], list[str], int]:
@@ -127,6 +129,19 @@ def _steps(fields: dict[str, str]) -> list[list[float]]:
         return []
     width = math.isqrt(len(matrix))
     return [[spacing[axis] * matrix[width * axis + k] for k in range(3)] for axis in range(3)]
+
+
+def _scale(path: Path, fields: dict[str, str]) -> tuple[float, float]:
+    """Slope and offset from the stored values to those that are meant, such as Hounsfield units."""
+    found = []
+    for name, default, least in (("Slope", "1", math.ulp(0.0)), ("Offset", "0", 0.0)):
+        text = fields.get(f"elementtointensityfunction{name.lower()}", default)
+        number = (parse_numbers([text]) or [math.nan])[0]
+        if not least <= abs(number) < math.inf:
+            what = f"ElementToIntensityFunction{name} '{text[:40]}'"
+            raise CaptureError(f"The MetaImage header of '{path}' has the {what}, which is no number it can be.")
+        found.append(number)
+    return found[0], found[1]
 
 
 def _first(fields: dict[str, str], names: tuple[str, ...], default: str) -> str:

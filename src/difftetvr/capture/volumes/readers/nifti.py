@@ -6,14 +6,15 @@ Source: https://nifti.nimh.nih.gov/nifti-1.
 from __future__ import annotations
 
 import io
+import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from difftetvr.capture.volumes.readers.packages import package
-from difftetvr.capture.volumes.stored import Encoding, Stored, first_bytes, require_memory
-from difftetvr.capture.volumes.volume_file import RawVolume, byte_count, parse_steps, three_axes, to_volume
+from difftetvr.capture.volumes.stored import Encoding, Stored, first_bytes
+from difftetvr.capture.volumes.volume_file import RawVolume, byte_count, parse_steps, scaled, three_axes, to_volume
 from difftetvr.errors import CaptureError
 
 # Bytes of the header, with which it begins: for version 1 and 2.
@@ -31,7 +32,8 @@ def read_nifti(path: Path) -> RawVolume:
     try:
         header = _header(nibabel, first_bytes(path, max(_CLASSES), encoding))
         dtype, sizes = header.get_data_dtype(), [int(n) for n in header.get_data_shape()]
-        (slope, intercept), steps = header.get_slope_inter(), _steps(header)
+        slope, intercept, notes = _scale(path, header)
+        steps = _steps(header)
         start = int(header.get_data_offset())
     except CaptureError:
         raise
@@ -47,11 +49,7 @@ def read_nifti(path: Path) -> RawVolume:
     spacing, directions = parse_steps(steps, path)
     size = byte_count(shape, dtype)
     values = to_volume(Stored(path, encoding, skip=max(start, 0)).read(size)[:size], shape, dtype, path)
-    if slope is not None and (slope, intercept) != (1.0, 0.0):
-        require_memory(path, 8 * values.size)
-        with np.errstate(over="ignore"):
-            values = values * np.float64(slope) + np.float64(intercept or 0.0)
-    return RawVolume(values, spacing, directions)
+    return RawVolume(scaled(values, slope, intercept, path), spacing, directions, notes)
 
 
 def _header(nibabel: Any, data: bytes) -> Any:
@@ -63,6 +61,18 @@ def _header(nibabel: Any, data: bytes) -> Any:
     if not bytes(header["magic"]).startswith(b"n+"):
         raise ValueError("it is not the beginning of a single file")
     return header
+
+
+def _scale(path: Path, header: Any) -> tuple[float, float, tuple[str, ...]]:
+    """Slope and intercept of the values, and what to say of them."""
+    # nibabel refuses headers of a slope alone.
+    slope, intercept = float(header["scl_slope"]), float(header["scl_inter"])
+    # By the format's definition 0 is no slope; NaN is what nibabel and others write for none.
+    if slope == 0.0 or not math.isfinite(slope):
+        return 1.0, 0.0, ()
+    if math.isfinite(intercept):
+        return slope, intercept, ()
+    return slope, 0.0, (f"The intercept of '{path}' is {intercept}; it is taken as 0, with the slope {slope:.6g}.",)
 
 
 def _steps(header: Any) -> list[list[float]]:

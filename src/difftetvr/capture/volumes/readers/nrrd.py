@@ -59,15 +59,15 @@ def read_nrrd(path: Path) -> RawVolume:
     if encoding not in _ENCODINGS and encoding not in _TEXT:
         raise CaptureError(f"'{path}' is encoded as '{fields['encoding']}'; save it as raw, gzip, bzip2 or text.")
     dtype = _dtype(path, fields, encoding)
-    steps = axis_steps(path, fields, axes)
-    spacing, directions = (None, None) if steps is None else parse_steps(steps, path)
+    told = axis_steps(path, fields, axes)
+    spacing, directions = (None, None) if told is None else parse_steps(told.steps, path)
     parts = _parts(path, fields, listed, header_size, shape)
     if encoding in _TEXT:
         text = b"\n".join(part.read_text(math.prod(shape) // len(parts)) for part in parts)
         values = text_to_volume(text, shape, dtype, path)
     else:
         values = to_volume(read_parts(parts, byte_count(shape, dtype), path), shape, dtype, path)
-    return RawVolume(values, spacing or (1.0, 1.0, 1.0), directions)
+    return RawVolume(values, spacing or (1.0, 1.0, 1.0), directions, told.notes if told else ())
 
 
 def _read_header(path: Path) -> tuple[dict[str, str], list[str], int]:

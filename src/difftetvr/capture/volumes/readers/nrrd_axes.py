@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
+from typing import NamedTuple
 
+from difftetvr.capture.volumes.units import filled, in_one_unit
 from difftetvr.capture.volumes.volume_file import parse_numbers
 from difftetvr.errors import CaptureError
 
@@ -44,25 +47,52 @@ def spatial_axes(path: Path, fields: dict[str, str]) -> list[int]:
     return axes
 
 
-def axis_steps(path: Path, fields: dict[str, str], axes: list[int]) -> list[list[float]] | None:
-    """From a sample to the next along each of the axes, in a right-handed world; None where the header does not say.
+class AxisSteps(NamedTuple):
+    """Where the axes lead.
+
+    Attributes:
+        steps: From a sample to the next along each of the axes, in a right-handed world.
+        notes: What was converted or assumed, a sentence each.
+    """
+
+    steps: list[list[float]]
+    notes: tuple[str, ...]
+
+
+def axis_steps(path: Path, fields: dict[str, str], axes: list[int]) -> AxisSteps | None:
+    """Where the axes lead; None where the header does not say.
 
     Raises:
         CaptureError: What it says is incomplete.
     """
-    if (vectors := _vectors(fields)) or "spacings" in fields:
-        words = vectors or fields["spacings"].split()
-        if len(words) <= max(axes):
-            raise CaptureError(f"The NRRD header of '{path}' does not tell the distances along all axes; correct it.")
-        chosen = [words[axis] for axis in axes]
-        steps = [_vector(word) for word in chosen] if vectors else _along_axes(parse_numbers(chosen))
+    notes: tuple[str, ...] = ()
+    if vectors := _vectors(fields):
+        steps = [_vector(word) for word in _chosen(path, vectors, axes)]
+        scales, notes = in_one_unit((1.0, 1.0, 1.0), _units(fields, "spaceunits", [0, 1, 2]), path)
+        steps = [[scale * part for scale, part in zip(scales, step)] if len(step) == 3 else step for step in steps]
+    elif "spacings" in fields:
+        words = _chosen(path, fields["spacings"].split(), axes)
+        steps, notes = _along_axes(path, fields, axes, parse_numbers(words), words)
     elif "axismins" in fields and "axismaxs" in fields:
-        steps = _along_axes(_distances(fields, axes))
+        words = [fields["axismins"], "to", fields["axismaxs"]]
+        steps, notes = _along_axes(path, fields, axes, _distances(fields, axes), words)
     else:
         return None
     if fields.get("space", "").lower() in _LEFT_HANDED:
         steps = [[-step[0], *step[1:]] for step in steps if step]
-    return steps
+    return AxisSteps(steps, notes)
+
+
+def _chosen(path: Path, words: list[str], axes: list[int]) -> list[str]:
+    if len(words) <= max(axes):
+        raise CaptureError(f"The NRRD header of '{path}' does not tell the distances along all axes; correct it.")
+    return [words[axis] for axis in axes]
+
+
+def _units(fields: dict[str, str], key: str, axes: list[int]) -> list[str]:
+    """Names of the units of axes, empty where they are not told."""
+    quoted = re.findall(r'"([^"]*)"', fields.get(key, ""))
+    return [quoted[axis] if axis < len(quoted) else "" for axis in axes]
 
 
 def _vectors(fields: dict[str, str]) -> list[str]:
@@ -73,8 +103,21 @@ def _vector(text: str) -> list[float]:
     return parse_numbers(text.strip("()").split(","))
 
 
-def _along_axes(distances: list[float]) -> list[list[float]]:
-    return [[d if axis == other else 0.0 for other in range(3)] for axis, d in enumerate(distances)]
+def _along_axes(
+    path: Path, fields: dict[str, str], axes: list[int], distances: list[float], words: list[str]
+) -> AxisSteps:
+    """Steps of so many units along x, y and z; by the format's definition, NaN is a distance that nobody knows."""
+    if len(distances) != 3:
+        given = " ".join(words)[:60]
+        raise CaptureError(f"'{path}' gives the sample distances '{given}'; it needs a number for each axis.")
+    known = filled([None if math.isnan(distance) else distance for distance in distances], path)
+    units = _units(fields, "units", axes)
+    told = [unit for unit, distance in zip(units, distances) if not math.isnan(distance)]
+    # What is not known has no unit, either.
+    units = [told[0] if told and math.isnan(distance) else unit for unit, distance in zip(units, distances)]
+    converted = in_one_unit(known.values, units, path)
+    steps = [[d if axis == other else 0.0 for other in range(3)] for axis, d in enumerate(converted.values)]
+    return AxisSteps(steps, (*known.notes, *converted.notes))
 
 
 def _distances(fields: dict[str, str], axes: list[int]) -> list[float]:

@@ -1,6 +1,6 @@
 """Volumes in TIFF files: a stack of pages, or a folder of slices. tifffile reads the pages.
 
-Sources: TIFF 6.0; https://imagej.net/formats/tiff and https://ome-model.readthedocs.io for the distances of samples.
+Sources: TIFF 6.0; the tag ImageDepth is that of SGI, for pages that are volumes.
 """
 
 from __future__ import annotations
@@ -8,8 +8,7 @@ from __future__ import annotations
 import logging
 import os
 import re
-import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -17,8 +16,9 @@ from typing import Any
 import numpy as np
 
 from difftetvr.capture.volumes.readers.packages import package
+from difftetvr.capture.volumes.readers.tiff_description import described
 from difftetvr.capture.volumes.stored import Stored, file_size, require_memory
-from difftetvr.capture.volumes.volume_file import RawVolume, parse_numbers
+from difftetvr.capture.volumes.volume_file import RawVolume
 from difftetvr.errors import CaptureError
 from difftetvr.trust import file_beside, require_modest
 
@@ -26,6 +26,7 @@ _LOG = logging.getLogger("tifffile")
 SUFFIXES = (".tif", ".tiff")
 # What photographs with cameras have beside or above their images.
 _OF_PHOTOGRAPHS = re.compile(r"(transforms.*|cameras)\.json|(cameras|images|points3D)\.(bin|txt)|sparse", re.IGNORECASE)
+_WHITE_IS_ZERO, _BLACK_IS_ZERO, _PALETTE = 0, 1, 3
 
 
 def is_folder_of_slices(path: Path) -> bool:
@@ -41,15 +42,17 @@ def read_tiff(path: Path) -> RawVolume:
     """
     with _opened(path) as (tiff, faults):
         pages = _pages(path, tiff)
-        count, spacing = _stack_of(path, tiff, len(pages))
-        if count < 2:
+        told = described(path, tiff)
+        depth = sum(page.imagedepth for page in pages)
+        if depth == 1 and (told.slices or 1) > 1:
+            values = _one_behind_the_other(path, pages[0], told.slices or 1, tiff.byteorder)
+        elif depth == 1:
             raise CaptureError(f"'{path}' holds a single slice; give a stack of them, or the folder with all slices.")
-        if count > len(pages):
-            values = _one_behind_the_other(path, pages[0], count, tiff.byteorder)
         else:
             require_modest(path, sum(page.nbytes for page in pages), "slices", CaptureError)
-            values = np.stack([_samples(path, page) for page in pages])
-    return RawVolume(values, spacing, notes=faults.notes(path))
+            values = np.concatenate([_samples(path, page) for page in pages])
+        values, notes = _as_brightness(path, pages[0], values, told.is_imagej)
+    return RawVolume(values, told.distances.values, notes=(*faults.notes(path), *told.distances.notes, *notes))
 
 
 def read_slices(path: Path) -> RawVolume:
@@ -65,16 +68,17 @@ def read_slices(path: Path) -> RawVolume:
         file = file_beside(path, name, CaptureError)
         with _opened(file) as (tiff, faults):
             pages = _pages(file, tiff)
-            if len(pages) != 1:
-                raise CaptureError(f"'{file}' holds {len(pages)} pages; give a folder of single slices, or one stack.")
+            if len(pages) != 1 or pages[0].imagedepth != 1:
+                raise CaptureError(f"'{file}' holds more than one slice; give a folder of single slices, or one stack.")
             require_modest(file, pages[0].nbytes, "slices", CaptureError)
             if not layers:
                 require_memory(path, len(files) * pages[0].nbytes)
-            layers.append(_samples(file, pages[0]))
+            layer, said = _as_brightness(file, pages[0], _samples(file, pages[0]), bool(tiff.imagej_metadata))
+            layers.append(layer)
         if (layers[-1].shape, layers[-1].dtype) != (layers[0].shape, layers[0].dtype):
             raise CaptureError(f"'{file}' has another size or type than '{files[0]}'; give slices that are alike.")
-        notes = notes or faults.notes(file)
-    return RawVolume(np.stack(layers), (1.0, 1.0, 1.0), notes=notes)
+        notes = notes or (*faults.notes(file), *said)
+    return RawVolume(np.concatenate(layers), (1.0, 1.0, 1.0), notes=notes)
 
 
 def _slices(path: Path) -> list[str]:
@@ -148,13 +152,15 @@ def _pages(path: Path, tiff: Any) -> list[Any]:
         if page.is_reduced or page.is_mask:
             continue
         pages.append(page)
-        if page.samplesperpixel != 1 or page.ndim != 2 or page.dtype is None or page.dtype.kind not in "buif":
-            raise CaptureError(f"'{path}' holds pictures with colours, or no numbers; give slices of one channel.")
-        if (page.shape, page.dtype) != (pages[0].shape, pages[0].dtype):
+        _require_scalars(path, page)
+        if _kind(page) != _kind(pages[0]):
             raise CaptureError(f"The pages of '{path}' differ in size or type; give slices that are alike.")
+        if page.imagedepth > 1 < len(pages):
+            raise CaptureError(f"'{path}' holds several volumes, one a page; save one of them.")
         stored = sum(page.databytecounts)
         ends = [start + count for start, count in zip(page.dataoffsets, page.databytecounts)]
-        is_short = page.compression == 1 and 8 * stored < page.bitspersample * page.imagewidth * page.imagelength
+        samples = page.imagewidth * page.imagelength * page.imagedepth
+        is_short = page.compression == 1 and 8 * stored < page.bitspersample * samples
         if not ends or max(ends) > size or 0 in page.databytecounts or is_short:
             raise CaptureError(f"'{path}' is damaged: it is shorter than its pages need; get the file anew.")
     if not pages:
@@ -162,59 +168,67 @@ def _pages(path: Path, tiff: Any) -> list[Any]:
     return pages
 
 
+def _kind(page: Any) -> tuple[Any, ...]:
+    """What pages of a stack have in common."""
+    return page.shape, page.dtype, page.photometric, page.bitspersample
+
+
+def _require_scalars(path: Path, page: Any) -> None:
+    """Checks that a page holds one number for each sample."""
+    if page.dtype is None or page.dtype.kind not in "buif":
+        raise CaptureError(f"'{path}' holds no integers or floats; give slices of such.")
+    kind = page.photometric
+    if page.samplesperpixel != 1 or kind not in (_WHITE_IS_ZERO, _BLACK_IS_ZERO, _PALETTE):
+        name = str(getattr(kind, "name", kind))
+        raise CaptureError(f"'{path}' holds pictures with colours ({name}); give slices of one channel.")
+    if page.shape not in ((page.imagelength, page.imagewidth), (page.imagedepth, page.imagelength, page.imagewidth)):
+        raise CaptureError(f"'{path}' holds no pictures of rows and columns; give slices of such.")
+
+
 def _samples(path: Path, page: Any) -> np.ndarray:
-    """(ny, nx) values of a page; truth values count as numbers from 0 to 1."""
+    """(nz, ny, nx) values of a page, mostly one layer; truth values count as numbers from 0 to 1."""
     values = np.asarray(page.asarray())
-    if values.shape != (page.imagelength, page.imagewidth):
+    if values.shape != page.shape:
         raise CaptureError(f"'{path}' is damaged: a page has another size than it says; get the file anew.")
+    values = values.reshape(page.imagedepth, page.imagelength, page.imagewidth)
     values = values.astype(np.int8) if values.dtype == np.bool_ else values
     return values.astype(values.dtype.newbyteorder("="), copy=False)
 
 
+def _as_brightness(path: Path, page: Any, values: np.ndarray, is_imagej: bool) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Values of which the greater are the brighter, of pages that are stored otherwise, and what to say of it.
+
+    Raises:
+        CaptureError: They stand for colours.
+    """
+    if page.photometric == _PALETTE:
+        return _without_palette(path, page, values, is_imagej)
+    if page.photometric == _BLACK_IS_ZERO:
+        return values, ()
+    if page.dtype.kind not in "bu":
+        return values, (f"'{path}' shows its least values as the brightest (WhiteIsZero); they are read as they are.",)
+    # Samples of 12 bits are unpacked to 16, and those of 1 bit are truth values.
+    most = values.dtype.type(2**page.bitspersample - 1)
+    return most - values, (f"'{path}' stores black as the greatest value (WhiteIsZero); its values are inverted.",)
+
+
+def _without_palette(path: Path, page: Any, values: np.ndarray, is_imagej: bool) -> tuple[np.ndarray, tuple[str, ...]]:
+    colors = np.asarray(() if page.colormap is None else page.colormap)
+    if is_imagej:
+        # Its look-up tables are how measured values are shown.
+        return values, (f"'{path}' is shown in colours by ImageJ; its values are read as they are.",)
+    if page.dtype.kind != "u" or colors.shape != (3, 2**page.bitspersample) or (colors != colors[0]).any():
+        raise CaptureError(f"'{path}' holds pictures with colours, by a palette; give slices of one channel.")
+    if np.array_equal(colors[0] >> 8, np.arange(256)):
+        return values, ()
+    return colors[0][values], (f"The greys of '{path}' are taken from its palette, from 0 to 65535.",)
+
+
 def _one_behind_the_other(path: Path, first: Any, count: int, order: str) -> np.ndarray:
-    """(count, ny, nx) slices of which ImageJ describes the first only, because they lie one behind the other."""
+    """(count, ny, nx) slices of which the first has a page only, because they lie one behind the other."""
     dtype = first.dtype.newbyteorder(order)
     size = count * first.nbytes
     data = Stored(path, start=first.dataoffsets[0]).read(size)[:size]
     if first.compression != 1 or len(data) != size:
         raise CaptureError(f"'{path}' is damaged: it holds fewer than the {count} slices it tells of; get it anew.")
     return np.frombuffer(data, dtype).reshape(count, *first.shape).astype(first.dtype.newbyteorder("="), copy=False)
-
-
-def _stack_of(path: Path, tiff: Any, pages: int) -> tuple[int, tuple[float, float, float]]:
-    """Number of slices and the distances of samples, as ImageJ or OME tell them, else 1."""
-    told = tiff.imagej_metadata or {}
-    more = {"channels": told.get("channels", 1), "time steps": told.get("frames", 1)}
-    spacing = None
-    if told:
-        spacing = _imagej_spacing(tiff.pages[0], told)
-    elif (pixels := _ome_pixels(tiff.pages[0].description)) is not None:
-        more = {"channels": pixels.get("SizeC", "1"), "time steps": pixels.get("SizeT", "1")}
-        spacing = parse_numbers([pixels.get(f"PhysicalSize{axis}", "1") for axis in "XYZ"])
-    for what, count in more.items():
-        if str(count) != "1":
-            raise CaptureError(f"'{path}' holds {count} {what}; give a stack of the slices of one of them.")
-    count = told.get("images", pages) if pages == 1 else pages
-    if not isinstance(count, int) or not spacing or not all(0 < s < float("inf") for s in spacing):
-        return (count if isinstance(count, int) else pages), (1.0, 1.0, 1.0)
-    return count, (spacing[0], spacing[1], spacing[2])
-
-
-def _imagej_spacing(page: Any, told: dict[str, Any]) -> Sequence[float]:
-    """Along x, y and z: the pixels' size from their resolution, the slices' distance as told."""
-    sides = []
-    for name in ("XResolution", "YResolution"):
-        pixels, units = page.tags[name].value if name in page.tags else (1, 1)
-        sides.append(float(units) / float(pixels) if pixels else 0.0)
-    return (*sides, *(parse_numbers([told.get("spacing", 1.0)]) or [0.0]))
-
-
-def _ome_pixels(description: str) -> ElementTree.Element | None:
-    """OME's description of the pixels; None where a page has none."""
-    if "<OME" not in description[:1000]:
-        return None
-    try:
-        root = ElementTree.fromstring(description.encode())
-    except ElementTree.ParseError:
-        return None
-    return next((element for element in root.iter() if element.tag.rpartition("}")[2] == "Pixels"), None)
