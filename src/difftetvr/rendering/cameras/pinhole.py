@@ -15,7 +15,8 @@ from difftetvr.rendering.cameras.rigid import transformed
 
 if TYPE_CHECKING:
     from difftetvr.backend import Backend
-    from difftetvr.rendering.traversal.rays import CameraRays
+    from difftetvr.rendering.rays import Rays
+    from difftetvr.rendering.traversal.rays import ImageRays
 
 _ORTHONORMALITY_TOLERANCE = 1e-3
 _FAR = 16.0  # distances of camera and target from the origin, in their distance from each other
@@ -163,7 +164,16 @@ class Camera:
         directions = torch.stack([columns, rows, torch.ones_like(rows)], dim=-1)
         return directions / directions.norm(dim=-1, keepdim=True)
 
-    def kernel_rays(self, backend: Backend) -> CameraRays:
+    def rays(self) -> Rays:
+        """The rays of all pixels in world space, (H, W); differentiable in the extrinsics."""
+        from difftetvr.rendering.rays import Rays  # late: it needs cameras' errors, not cameras
+
+        pose = self.world_to_camera.double()
+        directions = (self.ray_directions().to(pose.device)[..., None] * pose[:3, :3]).sum(-2)
+        origin = -(pose[:3, :3] * pose[:3, 3:]).sum(0)
+        return Rays(origin.expand(directions.shape), directions)
+
+    def kernel_rays(self, backend: Backend) -> ImageRays:
         """The camera's rays for kernels of a back end."""
         from difftetvr.rendering.cameras.pinhole_rays import PinholeRays  # late: cameras are there without kernels
 

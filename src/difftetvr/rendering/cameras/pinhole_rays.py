@@ -9,7 +9,14 @@ import drjit as dr
 import torch
 
 from difftetvr.backend import Backend
-from difftetvr.rendering.traversal.rays import Frame, largest_coordinate, rounding_of
+from difftetvr.rendering.traversal.rays import (
+    Frame,
+    Lanes,
+    lane_count,
+    lane_pixel,
+    largest_coordinate,
+    rounding_of,
+)
 
 if TYPE_CHECKING:
     from difftetvr.rendering.cameras.pinhole import Camera
@@ -31,6 +38,7 @@ class PinholeRays:
     cy: Any
     width: Any
     height: Any
+    size: tuple[int, int]
 
     @staticmethod
     def of(backend: Backend, camera: Camera) -> PinholeRays:
@@ -41,7 +49,28 @@ class PinholeRays:
         return PinholeRays(
             *(dr.gather(backend.Float, floats, backend.UInt(i)) for i in range(6)),
             *(dr.gather(backend.UInt, sizes, backend.UInt(i)) for i in range(2)),
+            (camera.width, camera.height),
         )
+
+    @property
+    def count(self) -> int:
+        """Number of pixels."""
+        return self.size[0] * self.size[1]
+
+    @property
+    def lane_count(self) -> int:
+        """Number of lanes: the size rounded up to whole blocks."""
+        return lane_count(*self.size)
+
+    def of_lanes(self, lane: Any) -> Lanes:
+        """Neighbouring lanes see neighbouring pixels, so rays share cells in cache."""
+        column, row, valid = lane_pixel(self, lane)
+        return Lanes(row * self.width + column, valid, self.frame(column, row))
+
+    def of_pixels(self, pixel: Any) -> Frame:
+        """Frames of the rays of some pixels."""
+        row = pixel // self.width
+        return self.frame(pixel - row * self.width, row)
 
     def frame(self, column: Any, row: Any) -> Frame:
         """Frame of the ray through the centre of a pixel (Duff et al. 2017, branch-free because z > 0)."""

@@ -1,11 +1,12 @@
-"""Where rays enter the mesh: per-pixel lists of the faces that start a walk, nearest first (Dr.Jit).
+"""Where rays enter the mesh: per-ray lists of the half-faces that start a walk, nearest first (Dr.Jit).
 
-Boundary faces are rasterised into the lists by the same exact rule as the walk; when the camera is inside the mesh, the
-cells that hold it come first.
+Boundary faces get into the lists by the same exact rule as the walk: a camera's are rasterised, those of other rays
+are looked for in a hierarchy. Where a ray starts inside the mesh, the cell that holds its origin comes first.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,132 +15,128 @@ import torch
 
 from difftetvr.backend import Backend
 from difftetvr.mesh import TetMesh
-from difftetvr.rendering.cameras.pinhole import Camera
-from difftetvr.rendering.tracers.camera_inside import cells_around_camera, start_rows
-from difftetvr.rendering.tracers.entry_table import EntryScene, EntryTable
-from difftetvr.rendering.tracers.rasterise import Hit, WorkItems, for_each_hit, work_items
+from difftetvr.rendering.tracers.bundle_hits import BundleScene
+from difftetvr.rendering.tracers.hits import Hit
+from difftetvr.rendering.tracers.rasterise import for_each_hit, work_items
+from difftetvr.rendering.tracers.scene import NONE, Scene, boundary_half_faces
+from difftetvr.rendering.tracers.starts import cells_around_camera, starts_at_camera
+from difftetvr.rendering.traversal.bundle import BundleRays
+
+Visit = Callable[[Hit], None]
 
 
 @dataclass(frozen=True)
 class EntryLists:
-    """Per-pixel lists of entry-table rows.
+    """Per-ray lists of half-faces through which a ray enters the mesh, or the cell it starts in.
 
     Attributes:
-        corners, cells, apices: The table as flat Dr.Jit arrays.
-        offset: (pixels,) start of each pixel's list in ``rows``.
-        count: (pixels,) length of each pixel's list.
-        rows: Row numbers, each pixel's nearest first.
-        camera_inside: Whether some walks start behind the camera and must be clipped there.
-        is_simple: Whether no pixel has more than one entry.
+        offset: (N,) start of each ray's list in ``half_faces``.
+        count: (N,) length of each ray's list.
+        half_faces: Each ray's nearest first.
+        has_starts: Whether some walks start behind the origin and must be clipped there.
+        is_simple: Whether no ray has more than one entry.
     """
 
-    corners: Any
-    cells: Any
-    apices: Any
     offset: Any
     count: Any
-    rows: Any
-    camera_inside: bool
+    half_faces: Any
+    has_starts: bool
     is_simple: bool
 
 
-def find_entries(backend: Backend, mesh: TetMesh, camera_vertices: torch.Tensor, camera: Camera) -> EntryLists:
-    """Entry lists of every pixel of a view.
+def find_entries(scene: Scene, mesh: TetMesh, vertices: torch.Tensor, limits: Any | None) -> EntryLists:
+    """Entry lists of every ray of a view.
 
     Args:
-        backend: Dr.Jit back end of the vertices' device and precision.
+        scene: The cells and the rays.
         mesh: Mesh, for its topology.
-        camera_vertices: (V, 3) vertices in camera space.
-        camera: Intrinsics and image size.
+        vertices: (V, 3) vertices in the space of the rays.
+        limits: (N, 2) distances between which each ray is looked at; None for all in front of it.
     """
-    table = EntryTable.boundary(mesh)
-    boundary_rows = table.cells.shape[0]
-    around = cells_around_camera(backend, mesh, camera_vertices)
-    if around is not None:
-        table = table.joined(EntryTable.of_cells(mesh, around))
-    scene = EntryScene(
-        backend,
-        camera,
-        camera.kernel_rays(backend),
-        backend.floats(camera_vertices),
-        *(backend.uints(part) for part in (table.corners, table.cells, table.apices)),
-    )
-    start = None if around is None else start_rows(scene, mesh, around, boundary_rows)
-    items = work_items(scene, 0, boundary_rows)
-    count, rows = _count(scene, items, start)
+    backend = scene.backend
+    start: Any | None
+    for_each: Callable[[Visit], None]
+    if isinstance(scene.rays, BundleRays):
+        bundle = BundleScene(scene, mesh, vertices, limits)
+        start, for_each = bundle.starts(), bundle.for_each_entry
+    else:
+        around = cells_around_camera(backend, mesh, vertices)
+        start = None if around is None else starts_at_camera(scene, mesh, around)
+        items = work_items(scene, backend.uints(boundary_half_faces(mesh)))
+        for_each = lambda visit: for_each_hit(scene, items, visit)  # noqa: E731
+    count, half_faces = _count(scene, start, for_each)
     is_simple = int(dr.max(count)[0]) <= 1
     if is_simple:
-        offset = dr.arange(backend.UInt, scene.pixel_count)
+        offset = dr.arange(backend.UInt, scene.rays.count)
     else:
         offset = _starts(backend, count)
-        rows = _sorted(scene, offset, count, *_fill(scene, items, start, offset, count))
-    inside = around is not None
-    return EntryLists(scene.corners, scene.cells, scene.apices, offset, count, rows, inside, is_simple)
+        half_faces = _sorted(scene, offset, count, *_fill(scene, start, for_each, offset, count))
+    return EntryLists(offset, count, half_faces, start is not None, is_simple)
 
 
-def _count(scene: EntryScene, items: WorkItems | None, start: Any | None) -> tuple[Any, Any]:
-    """Number of entries of each pixel, and one of them, which is all where no pixel has more."""
+def _count(scene: Scene, start: Any | None, for_each: Callable[[Visit], None]) -> tuple[Any, Any]:
+    """Number of entries of each ray, and one of them, which is all where no ray has more."""
     uint = scene.backend.UInt
-    count, row_of_pixel = dr.zeros(uint, scene.pixel_count), dr.zeros(uint, scene.pixel_count)
+    count, half_faces = dr.zeros(uint, scene.rays.count), dr.zeros(uint, scene.rays.count)
     if start is not None:
-        count, row_of_pixel = dr.select(start != scene.no_row, uint(1), uint(0)), uint(start)
-        scene.backend.run(count, row_of_pixel)
+        count, half_faces = dr.select(start != NONE, uint(1), uint(0)), uint(start)
+        scene.backend.run(count, half_faces)
 
     def visit(hit: Hit) -> None:
-        pixel = hit.row * scene.rays.width + hit.column
-        dr.scatter_add(count, uint(1), pixel, hit.is_hit)
-        dr.scatter(row_of_pixel, hit.face, pixel, hit.is_hit)
+        dr.scatter_add(count, uint(1), hit.pixel, hit.is_hit)
+        dr.scatter(half_faces, hit.half_face, hit.pixel, hit.is_hit)
 
-    for_each_hit(scene, items, visit)
-    scene.backend.run(count, row_of_pixel)
-    return count, row_of_pixel
+    for_each(visit)
+    scene.backend.run(count, half_faces)
+    return count, half_faces
 
 
 def _starts(backend: Backend, count: Any) -> Any:
-    """Where each pixel's list starts: the exclusive prefix sum of the lengths."""
+    """Where each ray's list starts: the exclusive prefix sum of the lengths."""
     counts = backend.tensor(backend.Int(count))
     return backend.uints((counts.cumsum(0) - counts).to(torch.int32))
 
 
-def _fill(scene: EntryScene, items: WorkItems | None, start: Any | None, offset: Any, count: Any) -> tuple[Any, Any]:
-    """Rows of every pixel and their depths, in any order within a pixel."""
-    uint, real = scene.backend.UInt, scene.backend.Float
-    total = int(offset[scene.pixel_count - 1]) + int(count[scene.pixel_count - 1])
-    rows, depths, used = dr.zeros(uint, total), dr.zeros(real, total), dr.zeros(uint, scene.pixel_count)
+def _fill(
+    scene: Scene, start: Any | None, for_each: Callable[[Visit], None], offset: Any, count: Any
+) -> tuple[Any, Any]:
+    """Half-faces of every ray and their depths, in any order within a ray."""
+    uint, real, last = scene.backend.UInt, scene.backend.Float, scene.rays.count - 1
+    total = int(offset[last]) + int(count[last])
+    half_faces, depths, used = dr.zeros(uint, total), dr.zeros(real, total), dr.zeros(uint, scene.rays.count)
     if start is not None:
-        has_start = start != scene.no_row
-        dr.scatter(rows, start, offset, has_start)
-        dr.scatter(depths, real(-1), offset, has_start)
+        has_start = start != NONE
+        dr.scatter(half_faces, start, offset, has_start)
+        dr.scatter(depths, real(-dr.inf), offset, has_start)
         used = dr.select(has_start, uint(1), uint(0))
-    scene.backend.run(rows, depths, used)
+    scene.backend.run(half_faces, depths, used)
 
     def visit(hit: Hit) -> None:
-        pixel = hit.row * scene.rays.width + hit.column
-        slot = dr.gather(uint, offset, pixel, hit.is_hit) + dr.scatter_inc(used, pixel, hit.is_hit)
-        dr.scatter(rows, hit.face, slot, hit.is_hit)
+        slot = dr.gather(uint, offset, hit.pixel, hit.is_hit) + dr.scatter_inc(used, hit.pixel, hit.is_hit)
+        dr.scatter(half_faces, hit.half_face, slot, hit.is_hit)
         dr.scatter(depths, hit.depth, slot, hit.is_hit)
 
-    for_each_hit(scene, items, visit)
-    scene.backend.run(rows, depths)
-    return rows, depths
+    for_each(visit)
+    scene.backend.run(half_faces, depths)
+    return half_faces, depths
 
 
-def _sorted(scene: EntryScene, offset: Any, count: Any, rows: Any, depths: Any) -> Any:
-    """Each pixel's rows by (depth, row): an entry's place is the number of smaller ones, for the lists are short."""
+def _sorted(scene: Scene, offset: Any, count: Any, half_faces: Any, depths: Any) -> Any:
+    """Each ray's entries by (depth, half-face): the place of one is the number of smaller ones, for lists are short."""
     uint, real = scene.backend.UInt, scene.backend.Float
     end = offset + count
-    ordered = dr.zeros(uint, dr.width(rows))
+    ordered = dr.zeros(uint, dr.width(half_faces))
 
     def place(position: Any) -> tuple[Any]:
-        row, depth = dr.gather(uint, rows, position), dr.gather(real, depths, position)
+        face, depth = dr.gather(uint, half_faces, position), dr.gather(real, depths, position)
 
         def compare(other: Any, rank: Any) -> tuple[Any, Any]:
-            other_row, other_depth = dr.gather(uint, rows, other), dr.gather(real, depths, other)
-            smaller = (other_depth < depth) | ((other_depth == depth) & (other_row < row))
+            other_face, other_depth = dr.gather(uint, half_faces, other), dr.gather(real, depths, other)
+            smaller = (other_depth < depth) | ((other_depth == depth) & (other_face < face))
             return other + 1, rank + dr.select(smaller, uint(1), uint(0))
 
         _, rank = dr.while_loop((uint(offset), dr.zeros(uint, 1)), lambda other, rank: other < end, compare)
-        dr.scatter(ordered, row, offset + rank)
+        dr.scatter(ordered, face, offset + rank)
         return (position + 1,)
 
     dr.while_loop((uint(offset),), lambda position: position < end, place)
