@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any, overload
@@ -14,9 +15,8 @@ from difftetvr.inputs import as_reals
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.optics import OpticalModel
 from difftetvr.rendering.autograd import RenderFunction
-from difftetvr.rendering.cameras.pinhole import Camera
 from difftetvr.rendering.preparation import PreparedView, ViewOptions, prepare_view
-from difftetvr.rendering.rays import Rays
+from difftetvr.rendering.rays import Rays, RaySource
 from difftetvr.rendering.scalar_field import ScalarField
 from difftetvr.rendering.traversal.records import Records
 
@@ -55,7 +55,7 @@ class RenderedImage:
 def render(
     mesh: TetMesh,
     field: Field | ScalarField,
-    camera: Camera | Rays,
+    camera: RaySource | Rays,
     background: Background = None,
     renderer: str = "marching",
     optics: OpticalModel | None = None,
@@ -69,7 +69,7 @@ def render(
 def render(
     mesh: TetMesh,
     field: Field | ScalarField,
-    camera: Sequence[Camera],
+    camera: Sequence[RaySource],
     background: Background = None,
     renderer: str = "marching",
     optics: OpticalModel | None = None,
@@ -83,7 +83,7 @@ def render(
 def render(
     mesh: TetMesh,
     field: Field | ScalarField,
-    camera: Camera | Rays | Sequence[Camera],
+    camera: RaySource | Rays | Sequence[RaySource],
     background: Background = None,
     renderer: str = "marching",
     optics: OpticalModel | None = None,
@@ -129,30 +129,31 @@ def render(
     if not isinstance(camera, Sequence):
         return one(camera)
     cameras = _checked_cameras(camera)
-    same = len({(c.height, c.width) for c in cameras}) == 1
     # One after the other where each view has its own colours, or its own order of cells.
     if renderer == "projected" or getattr(field, "harmonics", None) is not None:
-        images = [one(view) for view in cameras]
-        return _stacked(images) if same else tuple(images)
+        return _together([one(view) for view in cameras])
     bundles = [view.rays() for view in cameras]
-    if same:
-        origins, directions = (torch.stack([getattr(b, n) for b in bundles]) for n in ("origins", "directions"))
-        return one(Rays(origins, directions))
+    shapes = [tuple(bundle.shape) for bundle in bundles]
+    if len(set(shapes)) == 1:
+        return one(Rays.stacked(bundles))
     image, begin, parts = one(Rays.joined(bundles)), 0, []
-    for view in cameras:
-        part = image[begin : begin + view.height * view.width]
-        parts.append(part.reshaped(view.height, view.width))
-        begin += view.height * view.width
+    for shape in shapes:
+        end = begin + math.prod(shape)
+        parts.append(image[begin:end].reshaped(*shape))
+        begin = end
     return tuple(parts)
 
 
-def _checked_cameras(cameras: Sequence[Any]) -> list[Camera]:
-    if not cameras or not all(isinstance(camera, Camera) for camera in cameras):
-        raise DiffTetError(f"camera is {shown(cameras)}; pass a difftetvr.Camera, a list of them, or Rays.")
+def _checked_cameras(cameras: Sequence[Any]) -> list[RaySource]:
+    if not cameras or not all(isinstance(c, RaySource) and not isinstance(c, type) for c in cameras):
+        raise DiffTetError(f"camera is {shown(cameras)}; pass a difftetvr.Camera, a list of cameras, or difftetvr.Rays.")
     return list(cameras)
 
 
-def _stacked(images: Sequence[RenderedImage]) -> RenderedImage:
+def _together(images: Sequence[RenderedImage]) -> RenderedImage | tuple[RenderedImage, ...]:
+    """Images of one size as one, others as they are."""
+    if len({image.alpha.shape for image in images}) > 1:
+        return tuple(images)
     names = [field.name for field in fields(RenderedImage)]
     return RenderedImage(*(torch.stack([getattr(image, name) for image in images]) for name in names))
 
@@ -160,7 +161,7 @@ def _stacked(images: Sequence[RenderedImage]) -> RenderedImage:
 def _render(
     mesh: TetMesh,
     field: Field | ScalarField,
-    camera: Camera | Rays,
+    camera: RaySource | Rays,
     background: Background,
     options: ViewOptions,
     clip_plane: Sequence[float] | torch.Tensor | None,

@@ -10,7 +10,6 @@ import torch
 from difftetvr.errors import DiffTetError, shown
 from difftetvr.inputs import as_reals
 from difftetvr.rendering.cameras.pinhole import Camera
-from difftetvr.rendering.rays import Rays
 
 _FINITE = "give four finite numbers a, b, c, d, the first three not all 0"
 
@@ -46,14 +45,15 @@ def clip_limits(
 
 
 def clip_rays(
-    plane: Any, rays: Rays, origin: Sequence[float] = (0.0, 0.0, 0.0)
+    plane: Any, origins: torch.Tensor, directions: torch.Tensor, origin: Sequence[float] = (0.0, 0.0, 0.0)
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Distances between which lines lie in a half-space; differentiable in the plane and the rays.
 
     Args:
         plane: (4,) a, b, c, d of the half-space a x + b y + c z + d >= 0 in world space.
-        rays: Rays of unit directions, relative to ``origin``.
-        origin: (3,) point of world space that the rays count from.
+        origins: (..., 3) points of the lines, relative to ``origin``.
+        directions: (..., 3) their unit directions.
+        origin: (3,) point of world space that the points count from.
 
     Returns:
         (...) first and last distance, which may be infinite; the last is smaller where a line is outside.
@@ -61,8 +61,8 @@ def clip_rays(
     Raises:
         DiffTetError: These are not four finite numbers, or the normal (a, b, c) is zero.
     """
-    coefficients, offset = _plane(plane, rays.origins, origin)
-    slope, at_origin = ((part * coefficients).sum(-1) for part in (rays.directions, rays.origins))
+    coefficients, offset = _plane(plane, origins, origin)
+    slope, at_origin = ((part * coefficients).sum(-1) for part in (directions, origins))
     return _half_space(slope, at_origin + offset)
 
 

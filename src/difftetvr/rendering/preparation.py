@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, TypeGuard
 
 import torch
 
@@ -17,7 +17,7 @@ from difftetvr.optics import ConstantPerCell, ExactLinear, OpticalModel
 from difftetvr.rendering.autograd import TRACERS, Content, RenderTask
 from difftetvr.rendering.cameras.pinhole import Camera
 from difftetvr.rendering.clip_plane import clip_limits, clip_rays
-from difftetvr.rendering.rays import Rays, image_order
+from difftetvr.rendering.rays import Rays, RaySource, image_order
 from difftetvr.rendering.scalar_field import ScalarField
 
 RENDERERS = tuple(TRACERS)
@@ -92,7 +92,8 @@ class PreparedRays:
         shift: (N,) how far these origins are from the true ones, in world units.
         near, far: (N,) distances from the true origins between which rays are looked at, in world units.
         sees_all: Whether no ray starts or ends near the mesh.
-        rays: (N,) the rays themselves, relative to the mesh's origin.
+        origins: (N, 3) the true origins, relative to that of the mesh.
+        directions: (N, 3) unit directions.
     """
 
     lines: torch.Tensor
@@ -100,7 +101,8 @@ class PreparedRays:
     near: torch.Tensor
     far: torch.Tensor
     sees_all: bool
-    rays: Rays
+    origins: torch.Tensor
+    directions: torch.Tensor
 
     @staticmethod
     def of(rays: Rays, mesh: TetMesh) -> PreparedRays:
@@ -118,7 +120,7 @@ class PreparedRays:
         beyond = (shift.abs() + radius).mul(1.0 + 1e-5)
         is_fixed = not (near.requires_grad or far.requires_grad)
         sees_all = is_fixed and bool(((near <= shift - 1.001 * radius) & (far >= beyond)).all())
-        return PreparedRays(lines, shift, near, far, sees_all, Rays(origins, directions, near, far))
+        return PreparedRays(lines, shift, near, far, sees_all, origins, directions)
 
     def limits(self, clip_plane: Any, origin: Sequence[float], unit: float) -> torch.Tensor | None:
         """(N, 2) distances from these origins in the unit of kernels; None where nothing is cut off."""
@@ -126,18 +128,18 @@ class PreparedRays:
             return None
         near, far = self.near, self.far
         if clip_plane is not None:
-            first, last = clip_rays(clip_plane, self.rays, origin)
+            first, last = clip_rays(clip_plane, self.origins, self.directions, origin)
             near, far = torch.maximum(near, first), torch.minimum(far, last)
         return torch.stack((near - self.shift, far - self.shift), dim=1) / unit
 
 
 def prepare_view(
-    mesh: TetMesh, field: Field | ScalarField, camera: Camera | Rays, options: ViewOptions
+    mesh: TetMesh, field: Field | ScalarField, camera: RaySource | Rays, options: ViewOptions
 ) -> PreparedView:
     """Check a view's inputs and bring them to kernels; arguments and errors are those of :func:`difftetvr.render`."""
     options = _checked(mesh, field, camera, options)
     require_own_threads()  # here already, since in a copy of a process torch may hang, too
-    source = camera.relative_to(mesh.origin) if isinstance(camera, Camera) else camera
+    source = camera.relative_to(mesh.origin) if _is_plain(camera) else as_rays(camera)
     content, parts = _content(mesh, field, source)
     for tensor in parts:
         if tensor.device != mesh.vertices.device:
@@ -180,23 +182,34 @@ def _checked(mesh: Any, field: Any, camera: Any, options: ViewOptions) -> ViewOp
     """Refuse arguments of the wrong kind, those first that come in batches elsewhere."""
     require_type(mesh, TetMesh, "mesh", "pass a difftetvr.TetMesh", DiffTetError)
     require_type(field, (Field, ScalarField), "field", "pass one difftetvr.Field or ScalarField", DiffTetError)
-    require_type(camera, (Camera, Rays), "camera", "pass a difftetvr.Camera, a list of them, or Rays", DiffTetError)
+    if isinstance(camera, type) or not isinstance(camera, (Rays, RaySource)):
+        raise DiffTetError(f"camera is {shown(camera)}; pass a difftetvr.Camera, a list of cameras, or difftetvr.Rays.")
     optics, renderer = options.optics, options.renderer
     has_model = not isinstance(optics, type) and all(callable(getattr(optics, n, None)) for n in ("weights", "adjoint"))
     if not (optics is None or has_model):
         raise DiffTetError(f"optics is {shown(optics)}; pass a model, such as difftetvr.optics.ExactLinear().")
     if not isinstance(renderer, str) or renderer not in RENDERERS:
         raise DiffTetError(f"There is no renderer {shown(renderer)}; choose one of {', '.join(RENDERERS)}.")
-    if renderer == "projected" and isinstance(camera, Rays):
+    if renderer == "projected" and not _is_plain(camera):
         raise DiffTetError(
-            "The renderer 'projected' needs one order of cells for the whole view, which a bundle of rays does not "
-            "have; choose marching or linked-list."
+            "The renderer 'projected' needs one order of cells for the whole view, and knows it for pinhole cameras "
+            "alone, whose intrinsics require no gradient; choose marching or linked-list."
         )
     require_type(options.deterministic, bool, "deterministic", "pass True or False", DiffTetError)
     threshold = as_number(options.transmittance_threshold, "transmittance_threshold", DiffTetError)
     if not 0.0 <= threshold < 1.0:
         raise DiffTetError(f"transmittance_threshold is {threshold}; it must lie in [0, 1).")
     return ViewOptions(optics, threshold, options.deterministic, renderer)
+
+
+def _is_plain(camera: RaySource | Rays) -> TypeGuard[Camera]:
+    """Whether it is a camera that can be rasterised, and whose rays need no gradients but by the pose."""
+    return type(camera) is Camera and camera.intrinsics is None
+
+
+def as_rays(camera: RaySource | Rays) -> Rays:
+    """The rays of a camera, or what are rays."""
+    return camera if isinstance(camera, Rays) else camera.rays()
 
 
 def _content(
@@ -268,7 +281,7 @@ def _in_unit(bundle: PreparedRays, unit: float, backend: Backend) -> PreparedRay
     """Rays whose origins are in the unit of kernels, at their precision."""
     scale = bundle.lines.new_tensor([1.0 / unit] * 3 + [1.0] * 3)
     lines = (bundle.lines if unit == 1.0 else bundle.lines * scale).to(backend.dtype)
-    return PreparedRays(lines, bundle.shift, bundle.near, bundle.far, bundle.sees_all, bundle.rays)
+    return replace(bundle, lines=lines)
 
 
 def _parts_by_unit(content: Content, parts: tuple[torch.Tensor, ...], unit: float) -> tuple[torch.Tensor, ...]:

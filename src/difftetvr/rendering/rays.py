@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -130,12 +130,27 @@ class Rays:
         return replace(self, origins=self.origins.double() - shift)
 
     @staticmethod
+    def stacked(bundles: Sequence[Rays]) -> Rays:
+        """Several bundles of one shape as one, (B, ...)."""
+        vectors = [(bundle.origins, bundle.directions, *bundle.ends) for bundle in bundles]
+        return Rays(*(torch.stack(part) for part in zip(*vectors, strict=True)))
+
+    @staticmethod
     def joined(bundles: Sequence[Rays]) -> Rays:
         """The rays of several bundles one after the other, (N,)."""
         parts = [
             (b.origins.reshape(-1, 3), b.directions.reshape(-1, 3), *(e.reshape(-1) for e in b.ends)) for b in bundles
         ]
         return Rays(*(torch.cat(part) for part in zip(*parts, strict=True)))
+
+
+@runtime_checkable
+class RaySource(Protocol):
+    """Anything that sees along rays: a camera of any kind."""
+
+    def rays(self) -> Rays:
+        """The rays in world space: (H, W), one for each pixel, or (B, H, W) of several views."""
+        ...
 
 
 @lru_cache(maxsize=64)

@@ -16,6 +16,9 @@ from difftetvr.rendering.tracers.scene import Scene, boundary_half_faces
 from difftetvr.rendering.tracers.starts import NEAR, Start
 from difftetvr.rendering.traversal.walk import crossing_depth, find_exit, holds_ray
 
+_FACES_OF_A_LEAF = 1
+_CELLS_OF_A_LEAF = 2
+
 
 class BundleScene:
     """The cells of a mesh, and a bundle of rays that may cross them."""
@@ -47,7 +50,7 @@ class BundleScene:
             half_faces = boundary_half_faces(self.mesh)
             return SortedItems.of(half_faces, self.mesh.topology.boundary_faces, self.vertices)
 
-        return self._hierarchy("hierarchy.boundary", build)
+        return self._hierarchy("hierarchy.boundary", build, _FACES_OF_A_LEAF)
 
     @cached_property
     def cells(self) -> Hierarchy:
@@ -57,18 +60,24 @@ class BundleScene:
             cells = torch.arange(self.mesh.num_cells, device=self.mesh.tets.device)
             return SortedItems.of(cells, self.mesh.tets, self.vertices)
 
-        return self._hierarchy("hierarchy.cells", build)
+        return self._hierarchy("hierarchy.cells", build, _CELLS_OF_A_LEAF)
 
-    def _hierarchy(self, key: str, build: Callable[[], SortedItems]) -> Hierarchy:
-        return Hierarchy.over(self.scene.backend, self.mesh.topology.cached(key, build), self.vertices)
+    def _hierarchy(self, key: str, build: Callable[[], SortedItems], leaf_items: int) -> Hierarchy:
+        return Hierarchy.over(self.scene.backend, self.mesh.topology.cached(key, build), self.vertices, leaf_items)
 
     def for_each_entry(self, visit: Callable[[Hit], None]) -> None:
         """Call ``visit`` for all boundary faces that rays may enter through between their limits."""
 
         def at_face(half_face: Any, active: Any, state: Any) -> Any:
             face, _ = self.scene.face_and_apex(self.lanes.frame, half_face, active)
-            self._visit(visit, half_face, crossing_depth(face), holds_ray(face) & active)
-            return state
+
+            def held(state: Any) -> Any:
+                depth = crossing_depth(face)
+                is_hit = (depth > self.near) & (depth < self.far)
+                visit(Hit(self.lanes.pixel, self.lane, half_face, depth, is_hit))
+                return state
+
+            return dr.if_stmt((state,), holds_ray(face) & active, held, lambda state: state)
 
         self.boundary.meet_lines(self.lanes.frame, self.near, self.far, self.lanes.valid, at_face, self.lane)
 
@@ -77,18 +86,18 @@ class BundleScene:
 
         def at_cell(cell: Any, active: Any, state: Any) -> Any:
             is_crossed, half_face = self.scene.entered(self.lanes.frame, cell, active)
-            face, apex = self.scene.face_and_apex(self.lanes.frame, half_face, is_crossed)
-            exit_depth = crossing_depth(find_exit(face, apex).face(face, apex))
-            depth = crossing_depth(face)
-            is_hit = is_crossed & (exit_depth > self.near) & (depth < self.far)
-            visit(Hit(self.lanes.pixel, self.lane, half_face, depth, is_hit))
-            return state
+
+            def crossed(state: Any) -> Any:
+                face, apex = self.scene.face_and_apex(self.lanes.frame, half_face)
+                exit_depth = crossing_depth(find_exit(face, apex).face(face, apex))
+                depth = crossing_depth(face)
+                is_hit = (exit_depth > self.near) & (depth < self.far)
+                visit(Hit(self.lanes.pixel, self.lane, half_face, depth, is_hit))
+                return state
+
+            return dr.if_stmt((state,), is_crossed, crossed, lambda state: state)
 
         self.cells.meet_lines(self.lanes.frame, self.near, self.far, self.lanes.valid, at_cell, self.lane)
-
-    def _visit(self, visit: Callable[[Hit], None], half_face: Any, depth: Any, holds: Any) -> None:
-        is_hit = holds & (depth > self.near) & (depth < self.far)
-        visit(Hit(self.lanes.pixel, self.lane, half_face, depth, is_hit))
 
     def starts(self) -> Any | None:
         """(N,) half-face at which each ray starts inside the mesh, NONE where it does not; None if none of them do."""
@@ -100,9 +109,12 @@ class BundleScene:
         begin = tuple(dr.fma(self.near, d, o) for d, o in zip(frame.direction, frame.origin, strict=True))
 
         def at_cell(cell: Any, active: Any, start: Start) -> Start:
-            for k in range(4):
-                start = start.consider(scene, frame, adjacency, 4 * cell + k, self.near, active)
-            return start
+            is_crossed, half_face = scene.entered(frame, cell, active)
+
+            def crossed(start: Start) -> Start:
+                return start.consider(scene, frame, adjacency, half_face, self.near, True)
+
+            return dr.if_stmt((start,), is_crossed, crossed, lambda start: start)
 
         start = Start.at(scene.backend, self.near)
         start = self.cells.meet_points(begin, NEAR, self.lanes.valid, at_cell, start)

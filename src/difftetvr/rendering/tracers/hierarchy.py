@@ -19,7 +19,6 @@ from difftetvr.backend import Backend
 from difftetvr.mesh.arrays import chunks
 from difftetvr.rendering.traversal.rays import Frame, rounding_of
 
-_LEAF_ITEMS = 2
 _CURVE_BITS = 20  # of each coordinate
 
 
@@ -48,11 +47,13 @@ class Hierarchy:
 
     Attributes:
         backend: Array types.
-        boxes: (2 L, 8) centre, half sides and two of padding of each node; nodes without items have negative sides.
-        items: (I L) numbers of the items in the leaves, I each; padded.
-        count: Number of items, as a device value.
+        boxes: (2 L, 8) least and negated greatest coordinates of each node, and two of padding; infinite where it has
+            no items.
+        items: (N,) numbers of the items, those of a leaf next to each other.
+        count: N, as a device value.
         leaves: L, as a device value.
-        size: Greatest coordinate of any box, likewise.
+        leaf_items: How many items a leaf has.
+        size: Greatest coordinate of any box, as a device value.
     """
 
     backend: Backend
@@ -60,36 +61,36 @@ class Hierarchy:
     items: Any
     count: Any
     leaves: Any
+    leaf_items: int
     size: Any
 
     @staticmethod
-    def over(backend: Backend, sorted_items: SortedItems, vertices: torch.Tensor) -> Hierarchy:
-        """Build the boxes of items around (V, 3) positions."""
-        low, high = _boxes(vertices, sorted_items.corners)
-        items, count = sorted_items.items, sorted_items.items.shape[0]
-        leaves = 1 << max(0, (-(-count // _LEAF_ITEMS) - 1).bit_length())
-        missing = _LEAF_ITEMS * leaves - count
-        low, high = (
-            torch.cat((part, part.new_full((missing, 3), filler))).reshape(leaves, _LEAF_ITEMS, 3)
-            for part, filler in ((low, torch.inf), (high, -torch.inf))
-        )
-        lows, highs = [low.amin(1)], [high.amax(1)]
-        while lows[-1].shape[0] > 1:
-            lows.append(lows[-1].reshape(-1, 2, 3).amin(1))
-            highs.append(highs[-1].reshape(-1, 2, 3).amax(1))
-        low, high = (torch.cat((parts[-1], *reversed(parts))) for parts in (lows, highs))  # node 0 is none
-        empty = (low > high)[:, :1]
-        center = torch.where(empty, 0.0, 0.5 * (low + high))
-        # Rounded up, so that the box holds its items.
-        half = torch.where(empty, -torch.inf, torch.maximum(high - center, center - low))
-        boxes = torch.cat((center, half, half.new_zeros((half.shape[0], 2))), dim=1)
+    def over(backend: Backend, sorted_items: SortedItems, vertices: torch.Tensor, leaf_items: int) -> Hierarchy:
+        """Build the boxes of items.
+
+        Args:
+            backend: Back end of the vertices' device and precision.
+            sorted_items: The items.
+            vertices: (V, 3) positions.
+            leaf_items: Items in a leaf: one for speed, several for less memory.
+        """
+        count = sorted_items.items.shape[0]
+        used = -(-count // leaf_items)
+        leaves = 1 << max(0, (used - 1).bit_length())
+        boxes = torch.full((2 * leaves, 8), torch.inf, dtype=backend.dtype, device=backend.device)
+        boxes[leaves : leaves + used] = _leaf_boxes(backend, sorted_items, vertices, leaf_items)
+        level = leaves
+        while level > 1:
+            torch.minimum(boxes[level : 2 * level : 2], boxes[level + 1 : 2 * level : 2], out=boxes[level // 2 : level])
+            level //= 2
         hierarchy = Hierarchy(
             backend,
             backend.floats(boxes),
-            backend.uints(torch.cat((items, items.new_zeros(missing)))),
+            backend.uints(sorted_items.items),
             backend.opaque_uint(count),
             backend.opaque_uint(leaves),
-            backend.floats(torch.maximum(low[1].abs(), high[1].abs()).amax()[None]),
+            leaf_items,
+            backend.floats(boxes[1, :6].abs().amax()[None]),
         )
         backend.run(hierarchy.boxes, hierarchy.items, hierarchy.size)
         return hierarchy
@@ -154,19 +155,22 @@ class Hierarchy:
     ) -> Any:
         uint, float4 = self.backend.UInt, self.backend.Float4
 
+        def at_item(place: Any, state: Any) -> tuple[Any, Any]:
+            is_there = place < self.count
+            return place + 1, visit(dr.gather(uint, self.items, place, is_there), is_there, state)
+
         def at_leaf(node: Any, state: Any) -> Any:
-            first = (node - self.leaves) * _LEAF_ITEMS
-            end = first + _LEAF_ITEMS
-
-            def at_item(place: Any, state: Any) -> tuple[Any, Any]:
-                is_there = place < self.count
-                return place + 1, visit(dr.gather(uint, self.items, place, is_there), is_there, state)
-
+            first = (node - self.leaves) * self.leaf_items
+            if self.leaf_items == 1:
+                return at_item(first, state)[1]
+            end = first + self.leaf_items
             return dr.while_loop((first, state), lambda place, _: place < end, at_item)[1]
 
         def body(node: Any, state: Any) -> tuple[Any, Any]:
             first, second = (dr.gather(float4, self.boxes, 2 * node + k) for k in range(2))
-            is_met = test([first[0], first[1], first[2]], [first[3], second[0], second[1]])
+            low, high = [first[0], first[1], first[2]], [-first[3], -second[0], -second[1]]
+            center = [0.5 * (a + b) for a, b in zip(low, high, strict=True)]
+            is_met = test(center, [0.5 * (b - a) for a, b in zip(low, high, strict=True)])
             is_leaf = node >= self.leaves
             state = dr.if_stmt((node, state), is_met & is_leaf, at_leaf, lambda _, state: state)
             behind = node + 1
@@ -204,14 +208,23 @@ def _spread(values: torch.Tensor) -> torch.Tensor:
     return (values | (values << 2)) & 0x1249249249249249
 
 
-def _boxes(vertices: torch.Tensor, corners: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Least and greatest coordinates of items, each (N, 3)."""
-    lows, highs = [], []
-    for part in chunks(corners.shape[0], corners.device, width=6):
-        low = high = vertices.index_select(0, corners[part, 0])
-        for column in corners[part, 1:].unbind(1):
-            points = vertices.index_select(0, column)
-            low, high = torch.minimum(low, points), torch.maximum(high, points)
-        lows.append(low)
-        highs.append(high)
-    return torch.cat(lows), torch.cat(highs)
+def _leaf_boxes(
+    backend: Backend, sorted_items: SortedItems, vertices: torch.Tensor, leaf_items: int
+) -> torch.Tensor:
+    """(L, 8) least and negated greatest coordinates of the leaves that have items, and padding."""
+    uint, real = backend.UInt, backend.Float
+    positions, corners = backend.floats(vertices), backend.uints(sorted_items.corners)
+    count, width = sorted_items.corners.shape
+    leaf, last = dr.arange(uint, -(-count // leaf_items)), backend.opaque_uint(count - 1)
+    ends = [real(dr.inf) for _ in range(6)]
+    for k in range(leaf_items):
+        item = leaf_items * leaf + k
+        item = dr.select(item < last, item, last)
+        for column in range(width):
+            vertex = dr.gather(uint, corners, width * item + column)
+            point = [dr.gather(real, positions, 3 * vertex + axis) for axis in range(3)]
+            ends = [dr.fmin(a, b) for a, b in zip(ends, [*point, *(-x for x in point)], strict=True)]
+    boxes = dr.empty(real, 8 * dr.width(leaf))
+    dr.scatter(boxes, backend.Float4(*ends[:4]), 2 * leaf)
+    dr.scatter(boxes, backend.Float4(*ends[4:], 0, 0), 2 * leaf + 1)
+    return backend.tensor(boxes, -1, 8)
