@@ -34,7 +34,12 @@ from .mesh.tetmesh import TetMesh as TetMesh
 from .optics.transfer_function import TransferFunction as TransferFunction
 from .rendering.api import RenderedImage as RenderedImage
 from .rendering.api import render as render
+from .rendering.cameras.detector import Detector as Detector
+from .rendering.cameras.lens import LensCamera as LensCamera
+from .rendering.cameras.panoramic import PanoramicCamera as PanoramicCamera
+from .rendering.cameras.parallel import ParallelCamera as ParallelCamera
 from .rendering.cameras.pinhole import Camera as Camera
+from .rendering.rays import Rays as Rays
 from .rendering.scalar_field import ScalarField as ScalarField
 from .trust import trusting as trusting
 
@@ -44,14 +49,19 @@ __all__ = [
     "CameraError",
     "Capture",
     "CaptureError",
+    "Detector",
     "DiffTetError",
     "Field",
     "FitConfig",
     "FitError",
     "FitResult",
+    "LensCamera",
     "MeshData",
     "MeshError",
+    "PanoramicCamera",
+    "ParallelCamera",
     "PhotoCapture",
+    "Rays",
     "RenderedImage",
     "ScalarField",
     "TetMesh",

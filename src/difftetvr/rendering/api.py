@@ -146,7 +146,9 @@ def render(
 
 def _checked_cameras(cameras: Sequence[Any]) -> list[RaySource]:
     if not cameras or not all(isinstance(c, RaySource) and not isinstance(c, type) for c in cameras):
-        raise DiffTetError(f"camera is {shown(cameras)}; pass a difftetvr.Camera, a list of cameras, or difftetvr.Rays.")
+        raise DiffTetError(
+            f"camera is {shown(cameras)}; pass a difftetvr.Camera, a list of cameras, or difftetvr.Rays."
+        )
     return list(cameras)
 
 
@@ -168,7 +170,11 @@ def _render(
 ) -> RenderedImage:
     view = prepare_view(mesh, field, camera, options)
     behind = as_background(background, mesh.vertices, view.task.channels)
-    light, distance = RenderFunction.apply(view.task, view.vertices, view.limits(clip_plane), view.lines, *view.parts)
+    limits = view.limits(clip_plane)
+    if 0 in view.shape:
+        light, distance = (view.vertices[:0, :1].expand(0, n) for n in (Records(view.task.channels).width, 1))
+        return compose(view, light, distance[:, 0], behind, mesh.vertices.dtype)
+    light, distance = RenderFunction.apply(view.task, view.vertices, limits, view.lines, *view.parts)
     return compose(view, light, distance, behind, mesh.vertices.dtype)
 
 

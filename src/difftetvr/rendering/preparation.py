@@ -21,6 +21,7 @@ from difftetvr.rendering.rays import Rays, RaySource, image_order
 from difftetvr.rendering.scalar_field import ScalarField
 
 RENDERERS = tuple(TRACERS)
+CAMERAS = "pass a difftetvr.Camera, a list of cameras, or difftetvr.Rays"
 _REMOTE = 64.0  # distances of sizes of the mesh from which float32 loses more than the tests allow it
 _KNOW_FLOAT64 = ("cpu", "cuda")
 _SMALL = 1e-6  # within this and its inverse, coordinates are left as they are
@@ -183,7 +184,7 @@ def _checked(mesh: Any, field: Any, camera: Any, options: ViewOptions) -> ViewOp
     require_type(mesh, TetMesh, "mesh", "pass a difftetvr.TetMesh", DiffTetError)
     require_type(field, (Field, ScalarField), "field", "pass one difftetvr.Field or ScalarField", DiffTetError)
     if isinstance(camera, type) or not isinstance(camera, (Rays, RaySource)):
-        raise DiffTetError(f"camera is {shown(camera)}; pass a difftetvr.Camera, a list of cameras, or difftetvr.Rays.")
+        raise DiffTetError(f"camera is {shown(camera)}; {CAMERAS}.")
     optics, renderer = options.optics, options.renderer
     has_model = not isinstance(optics, type) and all(callable(getattr(optics, n, None)) for n in ("weights", "adjoint"))
     if not (optics is None or has_model):

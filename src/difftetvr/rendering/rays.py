@@ -88,8 +88,7 @@ class Rays:
                 f"{where} has the direction {shown(d[place].tolist())}; directions must be finite and not 0."
             )
         raise CameraError(
-            f"{where} is looked at from {float(near[place])} to {float(far[place])}; near must not be beyond "
-            "far."
+            f"{where} is looked at from {float(near[place])} to {float(far[place])}; near must not be beyond far."
         )
 
     @property

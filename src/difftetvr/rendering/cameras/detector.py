@@ -64,7 +64,9 @@ class Detector:
             object.__setattr__(self, name, vector)
         if len(views - {torch.Size([])}) > 1:
             counts = ", ".join(str(shape[0]) for shape in sorted(views - {torch.Size([])}))
-            raise CameraError(f"The detector's vectors are given for {counts} views; give each for one number of views.")
+            raise CameraError(
+                f"The detector's vectors are given for {counts} views; give each for one number of views."
+            )
 
     def rays(self) -> Rays:
         """The rays to the middle of each pixel in world space, (H, W) or (B, H, W)."""

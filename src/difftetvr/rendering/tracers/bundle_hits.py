@@ -13,7 +13,7 @@ from difftetvr.mesh import TetMesh
 from difftetvr.rendering.tracers.hierarchy import Hierarchy, SortedItems
 from difftetvr.rendering.tracers.hits import Hit
 from difftetvr.rendering.tracers.scene import Scene, boundary_half_faces
-from difftetvr.rendering.tracers.starts import NEAR, Start
+from difftetvr.rendering.tracers.starts import NEAR, StartSearch
 from difftetvr.rendering.traversal.walk import crossing_depth, find_exit, holds_ray
 
 _FACES_OF_A_LEAF = 1
@@ -99,26 +99,21 @@ class BundleScene:
 
         self.cells.meet_lines(self.lanes.frame, self.near, self.far, self.lanes.valid, at_cell, self.lane)
 
-    def starts(self) -> Any | None:
-        """(N,) half-face at which each ray starts inside the mesh, NONE where it does not; None if none of them do."""
-        if self.limits is None:
-            return None
-        scene, uint, frame = self.scene, self.scene.backend.UInt, self.lanes.frame
+    @property
+    def may_start_inside(self) -> bool:
+        """Whether rays may start inside the mesh."""
+        return self.limits is not None
+
+    def for_each_start(self, visit: Callable[[Hit], None]) -> None:
+        """Call ``visit`` for all cells in which rays may start."""
+        scene, frame = self.scene, self.lanes.frame
         adjacency = scene.backend.uints(self.mesh.topology.cell_adjacency)
+        search = StartSearch(scene, adjacency, self.lanes, self.lane, self.near)
         assert frame.origin is not None
         begin = tuple(dr.fma(self.near, d, o) for d, o in zip(frame.direction, frame.origin, strict=True))
 
-        def at_cell(cell: Any, active: Any, start: Start) -> Start:
-            is_crossed, half_face = scene.entered(frame, cell, active)
+        def at_cell(cell: Any, active: Any, state: Any) -> Any:
+            search.look_at(cell, active, visit)
+            return state
 
-            def crossed(start: Start) -> Start:
-                return start.consider(scene, frame, adjacency, half_face, self.near, True)
-
-            return dr.if_stmt((start,), is_crossed, crossed, lambda start: start)
-
-        start = Start.at(scene.backend, self.near)
-        start = self.cells.meet_points(begin, NEAR, self.lanes.valid, at_cell, start)
-        chosen, by_ray = start.chosen(self.near), dr.zeros(uint, scene.rays.count)
-        dr.scatter(by_ray, chosen, self.lanes.pixel, self.lanes.valid)
-        scene.backend.run(by_ray)
-        return by_ray
+        self.cells.meet_points(begin, NEAR, self.lanes.valid, at_cell, self.lane)

@@ -6,8 +6,9 @@ are looked for in a hierarchy. Where a ray starts inside the mesh, the cell that
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -18,11 +19,11 @@ from difftetvr.mesh import TetMesh
 from difftetvr.rendering.tracers.bundle_hits import BundleScene
 from difftetvr.rendering.tracers.hits import Hit
 from difftetvr.rendering.tracers.rasterise import for_each_hit, work_items
-from difftetvr.rendering.tracers.scene import NONE, Scene, boundary_half_faces
-from difftetvr.rendering.tracers.starts import cells_around_camera, starts_at_camera
+from difftetvr.rendering.tracers.scene import Scene, boundary_half_faces
+from difftetvr.rendering.tracers.starts import cells_around_camera, for_each_start_at_camera
 from difftetvr.rendering.traversal.bundle import BundleRays
 
-Visit = Callable[[Hit], None]
+Finder = Callable[[Callable[[Hit], None]], None]
 
 
 @dataclass(frozen=True)
@@ -54,40 +55,38 @@ def find_entries(scene: Scene, mesh: TetMesh, vertices: torch.Tensor, limits: An
         limits: (N, 2) distances between which each ray is looked at; None for all in front of it.
     """
     backend = scene.backend
-    start: Any | None
-    for_each: Callable[[Visit], None]
     if isinstance(scene.rays, BundleRays):
         bundle = BundleScene(scene, mesh, vertices, limits)
-        start, for_each = bundle.starts(), bundle.for_each_entry
+        finders = [bundle.for_each_start] if bundle.may_start_inside else []
+        has_starts = bundle.may_start_inside
+        finders.append(bundle.for_each_entry)
     else:
         around = cells_around_camera(backend, mesh, vertices)
-        start = None if around is None else starts_at_camera(scene, mesh, around)
-        items = work_items(scene, backend.uints(boundary_half_faces(mesh)))
-        for_each = lambda visit: for_each_hit(scene, items, visit)  # noqa: E731
-    count, half_faces = _count(scene, start, for_each)
+        has_starts = around is not None
+        finders = [] if around is None else [partial(for_each_start_at_camera, scene, mesh, around)]
+        finders.append(partial(for_each_hit, scene, work_items(scene, backend.uints(boundary_half_faces(mesh)))))
+    count, half_faces = _count(scene, finders)
     is_simple = int(dr.max(count)[0]) <= 1
     if is_simple:
         offset = dr.arange(backend.UInt, scene.rays.count)
     else:
         offset = _starts(backend, count)
-        half_faces = _sorted(scene, offset, count, *_fill(scene, start, for_each, offset, count))
-    return EntryLists(offset, count, half_faces, start is not None, is_simple)
+        half_faces = _sorted(scene, offset, count, *_fill(scene, finders, offset, count))
+    return EntryLists(offset, count, half_faces, has_starts, is_simple)
 
 
-def _count(scene: Scene, start: Any | None, for_each: Callable[[Visit], None]) -> tuple[Any, Any]:
+def _count(scene: Scene, finders: Sequence[Finder]) -> tuple[Any, Any]:
     """Number of entries of each ray, and one of them, which is all where no ray has more."""
     uint = scene.backend.UInt
     count, half_faces = dr.zeros(uint, scene.rays.count), dr.zeros(uint, scene.rays.count)
-    if start is not None:
-        count, half_faces = dr.select(start != NONE, uint(1), uint(0)), uint(start)
-        scene.backend.run(count, half_faces)
 
     def visit(hit: Hit) -> None:
         dr.scatter_add(count, uint(1), hit.pixel, hit.is_hit)
         dr.scatter(half_faces, hit.half_face, hit.pixel, hit.is_hit)
 
-    for_each(visit)
-    scene.backend.run(count, half_faces)
+    for for_each in finders:
+        for_each(visit)
+        scene.backend.run(count, half_faces)
     return count, half_faces
 
 
@@ -97,18 +96,11 @@ def _starts(backend: Backend, count: Any) -> Any:
     return backend.uints((counts.cumsum(0) - counts).to(torch.int32))
 
 
-def _fill(
-    scene: Scene, start: Any | None, for_each: Callable[[Visit], None], offset: Any, count: Any
-) -> tuple[Any, Any]:
+def _fill(scene: Scene, finders: Sequence[Finder], offset: Any, count: Any) -> tuple[Any, Any]:
     """Half-faces of every ray and their depths, in any order within a ray."""
     uint, real, last = scene.backend.UInt, scene.backend.Float, scene.rays.count - 1
     total = int(offset[last]) + int(count[last])
     half_faces, depths, used = dr.zeros(uint, total), dr.zeros(real, total), dr.zeros(uint, scene.rays.count)
-    if start is not None:
-        has_start = start != NONE
-        dr.scatter(half_faces, start, offset, has_start)
-        dr.scatter(depths, real(-dr.inf), offset, has_start)
-        used = dr.select(has_start, uint(1), uint(0))
     scene.backend.run(half_faces, depths, used)
 
     def visit(hit: Hit) -> None:
@@ -116,8 +108,9 @@ def _fill(
         dr.scatter(half_faces, hit.half_face, slot, hit.is_hit)
         dr.scatter(depths, hit.depth, slot, hit.is_hit)
 
-    for_each(visit)
-    scene.backend.run(half_faces, depths)
+    for for_each in finders:
+        for_each(visit)
+        scene.backend.run(half_faces, depths)
     return half_faces, depths
 
 

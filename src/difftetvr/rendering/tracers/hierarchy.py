@@ -208,9 +208,7 @@ def _spread(values: torch.Tensor) -> torch.Tensor:
     return (values | (values << 2)) & 0x1249249249249249
 
 
-def _leaf_boxes(
-    backend: Backend, sorted_items: SortedItems, vertices: torch.Tensor, leaf_items: int
-) -> torch.Tensor:
+def _leaf_boxes(backend: Backend, sorted_items: SortedItems, vertices: torch.Tensor, leaf_items: int) -> torch.Tensor:
     """(L, 8) least and negated greatest coordinates of the leaves that have items, and padding."""
     uint, real = backend.UInt, backend.Float
     positions, corners = backend.floats(vertices), backend.uints(sorted_items.corners)

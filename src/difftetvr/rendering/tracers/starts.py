@@ -1,7 +1,14 @@
-"""Where rays start when their origin is inside the mesh, or on or near its boundary (Dr.Jit)."""
+"""Where rays start when their origin is inside the mesh, or on or near its boundary (Dr.Jit).
+
+A path is a sequence of cells that a ray's line passes one after the other, from a boundary face to another. It has to
+be walked once if any of it lies ahead of the origin. If its first face does, it is entered there. Else it starts at its
+first cell that spans the origin: is entered before and left behind it. Depths grow along a path only but for rounding,
+and of several paths that end and begin at the origin some may seem to span it; every one is walked, and once.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,60 +18,67 @@ import torch
 from difftetvr.backend import Backend
 from difftetvr.mesh import TetMesh
 from difftetvr.mesh.topology.topology import LOCAL_FACES
-from difftetvr.rendering.tracers.scene import NONE, Scene
-from difftetvr.rendering.traversal.rays import Frame
-from difftetvr.rendering.traversal.walk import BOUNDARY, crossing_depth, find_exit, holds_ray
+from difftetvr.rendering.tracers.hits import Hit
+from difftetvr.rendering.tracers.scene import Scene
+from difftetvr.rendering.traversal.rays import Lanes
+from difftetvr.rendering.traversal.walk import BOUNDARY, crossing_depth, find_exit
 
 NEAR = 1e-4
 """Cells this near to an origin, relative to their size, are tried as the cell that holds it; each ray then decides."""
 
 
-@dataclass
-class Start:
-    """What is known of where rays start, while cells around their origins are looked at.
+@dataclass(frozen=True)
+class StartSearch:
+    """Tells which cells around their origins rays start in.
 
     Attributes:
-        half_face: Through which a ray would enter the cell that holds its origin; NONE while there is none.
-        farthest: Where it leaves that cell.
-        ahead: Where it enters the mesh in front of its origin.
-        rounding: By how much rounding may move these.
+        scene: The cells.
+        adjacency: Flat (T, 4) cells behind the half-faces.
+        rays: The rays.
+        lane: Their lanes.
+        near: Distance from which on each is looked at.
     """
 
-    half_face: Any
-    farthest: Any
-    ahead: Any
-    rounding: Any
+    scene: Scene
+    adjacency: Any
+    rays: Lanes
+    lane: Any
+    near: Any
 
-    @staticmethod
-    def at(backend: Backend, near: Any) -> Start:
-        """Nothing is known of rays that are looked at from a distance on."""
-        lanes = dr.width(near)
-        unknown = dr.full(backend.UInt, NONE, lanes), backend.Float(near), dr.full(backend.Float, dr.inf, lanes)
-        return Start(*unknown, dr.zeros(backend.Float, lanes))
+    def look_at(self, cell: Any, active: Any, visit: Callable[[Hit], None]) -> None:
+        """Call ``visit`` with the half-face through which a cell is entered, a hit if the ray starts there."""
+        is_crossed, half_face = self.scene.entered(self.rays.frame, cell, active)
 
-    def consider(self, scene: Scene, frame: Frame, adjacency: Any, half_face: Any, near: Any, active: Any) -> Start:
-        """Look at a half-face of a cell that is around the origin, or near it."""
-        face, apex = scene.face_and_apex(frame, half_face, active)
-        depth, exit_depth = crossing_depth(face), crossing_depth(find_exit(face, apex).face(face, apex))
-        holds = holds_ray(face) & active
-        spans = holds & (depth <= near) & (exit_depth > self.farthest)
-        is_boundary = dr.gather(scene.backend.UInt, adjacency, half_face, active) == BOUNDARY
-        enters = holds & (depth > near) & is_boundary
-        return Start(
-            dr.select(spans, half_face, self.half_face),
-            dr.select(spans, exit_depth, self.farthest),
-            dr.select(enters, dr.fmin(self.ahead, depth), self.ahead),
-            dr.select(active, dr.fmax(self.rounding, _rounding(face)), self.rounding),
-        )
+        def crossed(half_face: Any) -> Any:
+            face, apex = self.scene.face_and_apex(self.rays.frame, half_face)
+            depth, exit_depth = crossing_depth(face), crossing_depth(find_exit(face, apex).face(face, apex))
+            spans = (depth <= self.near) & (exit_depth > self.near)
+            visit(Hit(self.rays.pixel, self.lane, half_face, depth, self._is_first(half_face, spans)))
+            return half_face
 
-    def chosen(self, near: Any) -> Any:
-        """The half-face to start at.
+        dr.if_stmt((half_face,), is_crossed, crossed, lambda half_face: half_face)
 
-        Depths within rounding of the origin need not grow along a ray. Where it enters through a boundary face ahead
-        and before the end of the cell found here, or within rounding, both belong to one path, and it starts there.
+    def _is_first(self, half_face: Any, spans: Any) -> Any:
+        """Whether no cell of the path before this one spans the origin, and its first face does not lie ahead.
+
+        The path is followed back only as far as rounding leaves a doubt, which mostly is nowhere.
         """
-        enters = (self.ahead < self.farthest) | (self.ahead - near <= self.rounding)
-        return dr.select(enters, NONE, self.half_face)
+        scene, frame, near = self.scene, self.rays.frame, self.near
+
+        def back(half_face: Any, is_first: Any, active: Any) -> tuple[Any, Any, Any]:
+            face, _ = scene.face_and_apex(frame, half_face, active)
+            depth, behind = crossing_depth(face), dr.gather(scene.backend.UInt, self.adjacency, half_face, active)
+            in_doubt = active & (depth >= near - _rounding(face))
+            at_boundary = in_doubt & (behind == BOUNDARY)
+            goes_on = in_doubt & ~at_boundary
+            _, before = scene.entered(frame, behind, goes_on)
+            earlier, _ = scene.face_and_apex(frame, before, goes_on)
+            spans_earlier = goes_on & (crossing_depth(earlier) <= near) & (depth > near)
+            is_first &= ~((at_boundary & (depth > near)) | spans_earlier)
+            goes_on &= ~spans_earlier
+            return dr.select(goes_on, before, half_face), is_first, goes_on
+
+        return dr.while_loop((half_face, spans, spans), lambda half_face, first, active: active, back)[1]
 
 
 def _rounding(face: Any) -> Any:
@@ -76,27 +90,27 @@ def _rounding(face: Any) -> Any:
     return 16.0 * dr.epsilon(size) * size
 
 
-def starts_at_camera(scene: Scene, mesh: TetMesh, around: torch.Tensor) -> Any:
-    """(pixels,) half-face at which each ray of a camera starts inside the mesh; NONE where it does not.
+def for_each_start_at_camera(scene: Scene, mesh: TetMesh, around: torch.Tensor, visit: Callable[[Hit], None]) -> None:
+    """Call ``visit`` for the cells in which rays of a camera may start.
 
     Args:
         scene: The cells, and the camera's rays.
         mesh: Mesh, for its adjacency.
         around: Cells around the camera.
+        visit: Takes a hit.
     """
     backend, uint = scene.backend, scene.backend.UInt
-    frame = scene.rays.of_pixels(dr.arange(uint, scene.rays.count))
-    cells, adjacency = backend.uints(around), backend.uints(mesh.topology.cell_adjacency)
-    near, count = dr.zeros(backend.Float, scene.rays.count), backend.opaque_uint(4 * around.shape[0])
+    lane = dr.arange(uint, scene.rays.lane_count)
+    rays = scene.rays.of_lanes(lane)
+    cells, count = backend.uints(around), backend.opaque_uint(around.shape[0])
+    near = dr.zeros(backend.Float, scene.rays.lane_count)
+    search = StartSearch(scene, backend.uints(mesh.topology.cell_adjacency), rays, lane, near)
 
-    def body(index: Any, start: Start) -> tuple[Any, Start]:
-        half_face = 4 * dr.gather(uint, cells, index >> 2) + (index & 3)
-        return index + 1, start.consider(scene, frame, adjacency, half_face, near, True)
+    def body(index: Any) -> tuple[Any]:
+        search.look_at(dr.gather(uint, cells, index), rays.valid, visit)
+        return (index + 1,)
 
-    state = (dr.zeros(uint, scene.rays.count), Start.at(backend, near))
-    start = dr.while_loop(state, lambda index, _: index < count, body)[1].chosen(near)
-    backend.run(start)
-    return start
+    dr.while_loop((dr.zeros(uint, scene.rays.lane_count),), lambda index: index < count, body)
 
 
 def cells_around_camera(backend: Backend, mesh: TetMesh, camera_vertices: torch.Tensor) -> torch.Tensor | None:
