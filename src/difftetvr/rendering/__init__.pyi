@@ -8,6 +8,7 @@ from . import kernels as kernels
 from . import preparation as preparation
 from . import rays as rays
 from . import scalar_field as scalar_field
+from . import search as search
 from . import tracers as tracers
 from . import traversal as traversal
 from .api import RenderedImage as RenderedImage

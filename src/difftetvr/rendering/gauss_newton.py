@@ -195,8 +195,8 @@ def model_image(
     with backend.exclusive(one_thread=deterministic):
         tracer = view.task.tracer(view.vertices, None, view.lines, view.parts)
         light, distance = render_forward(tracer)
-        records = backend.tensor(light, -1, tracer.view.records.width)
-        image = compose(view, records, backend.tensor(distance), behind, view.vertices.dtype).color
+        gathered = backend.tensor(light, -1, tracer.view.records.width)
+        image = compose(view, gathered, backend.tensor(distance), behind, view.vertices.dtype).color
         residual = image - truth.to(image)
         if valid is not None:
             residual = residual * valid.to(residual.device)[..., None]

@@ -149,6 +149,7 @@ def prepare_view(
             )
     order: torch.Tensor | None = None
     bundle: PreparedRays | None = None
+    shape: tuple[int, ...]
     if isinstance(source, Camera):
         positions, shape = _camera_space(mesh, source), (source.height, source.width)
     else:

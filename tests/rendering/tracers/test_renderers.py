@@ -17,9 +17,9 @@ from difftetvr.errors import DiffTetError, MeshError
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.rendering import Camera, OrderWarning, render
 from difftetvr.rendering.inspection import inspect_rays
+from difftetvr.rendering.search.scene import Scene as CellScene
 from difftetvr.rendering.tracers import linked_list, projected
 from difftetvr.rendering.tracers.bands import bands_of
-from difftetvr.rendering.tracers.scene import Scene as CellScene
 from difftetvr.rendering.tracers.tiles import Tiler
 
 RENDERERS = ("marching", "linked-list", "projected")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from difftetvr.errors import CameraError
+from difftetvr.errors import CameraError, shown
 from difftetvr.inputs import as_reals
 from difftetvr.rendering.cameras.pinhole import Camera, Vector, number
 
@@ -43,7 +43,7 @@ class ParallelCamera:
             object.__setattr__(self, name, getattr(frame, name))
         size = as_reals(self.pixel_size, "The camera's pixel_size", CameraError, torch.float64, "pass a number")
         if size.numel() not in (1, 2) or not bool((torch.isfinite(size.detach()) & (size.detach() > 0)).all()):
-            raise CameraError(f"The camera's pixel_size is {size.tolist()}; give one or two numbers greater than 0.")
+            raise CameraError(f"The camera's pixel_size is {shown(self.pixel_size)}; give one or two positive numbers.")
         object.__setattr__(self, "pixel_size", size.reshape(-1).expand(2))
         near = number("near", self.near)
         if math.isnan(near) or near == math.inf:

@@ -210,9 +210,9 @@ class Camera:
         """The same view at another resolution."""
         width, height = _size("width", width), _size("height", height)
         sx, sy = width / self.width, height / self.height
-        values = {"fx": self.fx * sx, "fy": self.fy * sy, "cx": self.cx * sx, "cy": self.cy * sy}
         own = None if self.intrinsics is None else self.intrinsics * self.intrinsics.new_tensor([sx, sy, sx, sy])
-        return replace(self, width=width, height=height, intrinsics=own, **values)
+        fx, fy, cx, cy = self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy
+        return replace(self, fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height, intrinsics=own)
 
     def relative_to(self, origin: Sequence[float]) -> Camera:
         """The same view of a world whose origin lies at a point of this one; differentiable in the extrinsics.

@@ -28,8 +28,9 @@ _NEAR_PLANE = 2.0**-8  # points nearer to the camera's plane, in units of their 
 
 @dataclass
 class PinholeRays:
-    """Intrinsics and image size as device values, so that a new view needs no recompilation; see `CameraRays`."""
+    """Intrinsics and image size as device values, so that a new view needs no recompilation; see `ImageRays`."""
 
+    size: tuple[int, int]
     inverse_fx: Any
     inverse_fy: Any
     fx: Any
@@ -38,7 +39,6 @@ class PinholeRays:
     cy: Any
     width: Any
     height: Any
-    size: tuple[int, int]
 
     @staticmethod
     def of(backend: Backend, camera: Camera) -> PinholeRays:
@@ -47,9 +47,9 @@ class PinholeRays:
         floats = backend.floats(torch.tensor(values, dtype=backend.dtype, device=backend.device))
         sizes = backend.uints(torch.tensor([camera.width, camera.height], dtype=torch.int32, device=backend.device))
         return PinholeRays(
+            (camera.width, camera.height),
             *(dr.gather(backend.Float, floats, backend.UInt(i)) for i in range(6)),
             *(dr.gather(backend.UInt, sizes, backend.UInt(i)) for i in range(2)),
-            (camera.width, camera.height),
         )
 
     @property

@@ -14,12 +14,12 @@ import drjit as dr
 import torch
 
 from difftetvr.mesh import TetMesh
+from difftetvr.rendering.search.bundle_hits import BundleScene
+from difftetvr.rendering.search.hits import Hit
+from difftetvr.rendering.search.rasterise import for_each_hit, work_items
+from difftetvr.rendering.search.scene import NONE, Scene
+from difftetvr.rendering.search.starts import cells_around_camera
 from difftetvr.rendering.tracers.bands import Band
-from difftetvr.rendering.tracers.bundle_hits import BundleScene
-from difftetvr.rendering.tracers.hits import Hit
-from difftetvr.rendering.tracers.rasterise import for_each_hit, work_items
-from difftetvr.rendering.tracers.scene import NONE, Scene
-from difftetvr.rendering.tracers.starts import cells_around_camera
 from difftetvr.rendering.traversal.bundle import BundleRays
 from difftetvr.rendering.traversal.walk import crossing_depth, find_exit, holds_ray
 

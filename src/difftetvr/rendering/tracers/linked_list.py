@@ -16,9 +16,9 @@ import torch
 
 from difftetvr.backend import Backend
 from difftetvr.mesh import TetMesh
+from difftetvr.rendering.search.scene import NONE, Scene
 from difftetvr.rendering.tracers.bands import Band, bands_of
 from difftetvr.rendering.tracers.fragments import FragmentLists, FragmentRaster
-from difftetvr.rendering.tracers.scene import NONE, Scene
 from difftetvr.rendering.traversal.crossing import Kernel, View, cross_cell, lanes_of
 from difftetvr.rendering.traversal.rays import Lanes
 

@@ -13,8 +13,8 @@ import drjit as dr
 import torch
 
 from difftetvr.mesh import TetMesh
-from difftetvr.rendering.tracers.entry import EntryLists, find_entries
-from difftetvr.rendering.tracers.scene import Scene
+from difftetvr.rendering.search.entry import EntryLists, find_entries
+from difftetvr.rendering.search.scene import Scene
 from difftetvr.rendering.traversal.crossing import Kernel, Step, View, lanes_of
 from difftetvr.rendering.traversal.rays import Lanes
 from difftetvr.rendering.traversal.walk import BOUNDARY, Face, interpolate, make_face, table_row, walk_table

@@ -16,8 +16,8 @@ import drjit as dr
 import torch
 
 from difftetvr.mesh import TetMesh
+from difftetvr.rendering.search.scene import Scene
 from difftetvr.rendering.tracers.cell_order import visibility_order
-from difftetvr.rendering.tracers.scene import Scene
 from difftetvr.rendering.tracers.tiles import TILE_BITS, TileLists, Tiler
 from difftetvr.rendering.traversal.crossing import Kernel, View, cross_cell, lanes_of
 from difftetvr.rendering.traversal.rays import Lanes
@@ -73,7 +73,7 @@ class Projected:
         kernel.finish(ray)
 
     def _composite(self, kernel: Kernel, rays: Lanes, lists: TileLists, ray: Any) -> Any:
-        uint, width = self.view.backend.UInt, self.scene.rays.width
+        uint, width = self.view.backend.UInt, self.scene.image.width
         row = rays.pixel // width
         tile = (row >> TILE_BITS) * self.tiler.columns + ((rays.pixel - row * width) >> TILE_BITS)
         end = dr.gather(uint, lists.end, tile, rays.valid)

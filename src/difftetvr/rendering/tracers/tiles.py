@@ -8,8 +8,8 @@ from typing import Any
 import drjit as dr
 import torch
 
+from difftetvr.rendering.search.scene import Scene
 from difftetvr.rendering.tracers.bands import bands_of
-from difftetvr.rendering.tracers.scene import Scene
 
 TILE_BITS = 2
 """Tiles have 4 x 4 pixels: those of 16 lanes that lie side by side in Morton order, a vector of AVX-512."""
@@ -41,13 +41,13 @@ class Tiler:
             budget: Pairs of cell and tile to hold at a time; a single cell may have more.
         """
         self.scene = scene
-        width, height = scene.rays.size
+        width, height = scene.image.size
         self.columns = _tiles(width)
         self.count = self.columns * _tiles(height)
         backend, uint = scene.backend, scene.backend.UInt
         cell = backend.uints(order.to(torch.int32))
         corners = scene.cell(cell)
-        columns, rows, visible = scene.rays.pixel_range(scene.backend, [scene.point(corners[k]) for k in range(4)])
+        columns, rows, visible = scene.image.pixel_range(scene.backend, [scene.point(corners[k]) for k in range(4)])
         shift = lambda value: uint(dr.select(visible, value, 0)) >> TILE_BITS  # noqa: E731
         column0, column1, row0, row1 = (shift(value) for value in (*columns, *rows))
         self.width = backend.Int(column1 - column0 + 1)

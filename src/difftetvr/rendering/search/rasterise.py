@@ -9,8 +9,8 @@ from typing import Any
 import drjit as dr
 import torch
 
-from difftetvr.rendering.tracers.hits import Hit
-from difftetvr.rendering.tracers.scene import Scene
+from difftetvr.rendering.search.hits import Hit
+from difftetvr.rendering.search.scene import Scene
 from difftetvr.rendering.traversal.rays import largest_coordinate, pixel_lane, rounding_of
 from difftetvr.rendering.traversal.walk import Corner, crossing_depth, holds_ray, interpolate, make_face
 
@@ -39,7 +39,7 @@ def work_items(scene: Scene, half_face: Any) -> WorkItems | None:
     backend, uint, integer = scene.backend, scene.backend.UInt, scene.backend.Int
     faces = dr.width(half_face)
     points = [scene.point(vertex) for vertex in scene.indices_and_apex(half_face)[:3]]
-    (column0, column1), (row0, row1), visible = scene.rays.pixel_range(backend, points)
+    (column0, column1), (row0, row1), visible = scene.image.pixel_range(backend, points)
     width = dr.fmax(scene.backend.Float(column1 - column0 + 1), 1.0)
     per_item = integer(dr.fmin(dr.fmax(_ITEM_PIXELS / width, 1.0), float(_ITEM_ROWS)))
     count = dr.select(visible & _may_face_camera(points), (row1 - row0 + per_item) // per_item, 0)
@@ -87,7 +87,7 @@ def for_each_hit(scene: Scene, items: WorkItems | None, visit: Callable[[Hit], N
     passes_camera = nearest <= rounding_of(largest_coordinate(points))
 
     def body(column: Any, row: Any) -> tuple[Any, Any]:
-        frame = scene.rays.frame(column, row)
+        frame = scene.image.frame(column, row)
         corners = []
         for vertex, point in zip(vertices, points, strict=True):
             a, b, t = frame.project(*point)
@@ -99,8 +99,8 @@ def for_each_hit(scene: Scene, items: WorkItems | None, visit: Callable[[Hit], N
         simple = lambda face: interpolate(face)[0]  # noqa: E731
         depth = dr.if_stmt((face,), passes_camera, exact, simple)
         is_hit = holds_ray(face) & (~passes_camera | (depth > 0))
-        pixel = row * scene.rays.width + column
-        visit(Hit(pixel, pixel_lane(scene.rays, column, row), items.half_face, depth, is_hit))
+        pixel = row * scene.image.width + column
+        visit(Hit(pixel, pixel_lane(scene.image, column, row), items.half_face, depth, is_hit))
         ends = column == items.last_column
         return dr.select(ends, items.first_column, column + 1), dr.select(ends, row + 1, row)
 

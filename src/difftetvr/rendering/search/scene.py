@@ -7,7 +7,7 @@ crossings that enter the cell there.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import drjit as dr
 import torch
@@ -15,7 +15,7 @@ import torch
 from difftetvr.backend import Backend
 from difftetvr.mesh import TetMesh
 from difftetvr.mesh.topology.topology import LOCAL_FACES
-from difftetvr.rendering.traversal.rays import Frame, KernelRays, edge_function, is_left
+from difftetvr.rendering.traversal.rays import Frame, ImageRays, KernelRays, edge_function, is_left
 from difftetvr.rendering.traversal.walk import Corner, Face, make_face
 
 NONE = 0xFFFFFFFF
@@ -44,6 +44,11 @@ class Scene:
     def of(backend: Backend, rays: KernelRays, mesh: TetMesh, vertices: torch.Tensor) -> Scene:
         """Upload a mesh with (V, 3) vertices in the space of the rays."""
         return Scene(backend, rays, backend.floats(vertices), backend.uints(mesh.tets), mesh.num_cells)
+
+    @property
+    def image(self) -> ImageRays:
+        """The rays, where they are a camera's."""
+        return cast("ImageRays", self.rays)
 
     def point(self, vertex: Any, mask: Any = True) -> list[Any]:
         """Position of a vertex."""

@@ -18,8 +18,8 @@ import torch
 from difftetvr.backend import Backend
 from difftetvr.mesh import TetMesh
 from difftetvr.mesh.topology.topology import LOCAL_FACES
-from difftetvr.rendering.tracers.hits import Hit
-from difftetvr.rendering.tracers.scene import Scene
+from difftetvr.rendering.search.hits import Hit
+from difftetvr.rendering.search.scene import Scene
 from difftetvr.rendering.traversal.rays import Lanes
 from difftetvr.rendering.traversal.walk import BOUNDARY, crossing_depth, find_exit
 

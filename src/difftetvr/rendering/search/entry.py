@@ -16,11 +16,11 @@ import torch
 
 from difftetvr.backend import Backend
 from difftetvr.mesh import TetMesh
-from difftetvr.rendering.tracers.bundle_hits import BundleScene
-from difftetvr.rendering.tracers.hits import Hit
-from difftetvr.rendering.tracers.rasterise import for_each_hit, work_items
-from difftetvr.rendering.tracers.scene import Scene, boundary_half_faces
-from difftetvr.rendering.tracers.starts import cells_around_camera, for_each_start_at_camera
+from difftetvr.rendering.search.bundle_hits import BundleScene
+from difftetvr.rendering.search.hits import Hit
+from difftetvr.rendering.search.rasterise import for_each_hit, work_items
+from difftetvr.rendering.search.scene import Scene, boundary_half_faces
+from difftetvr.rendering.search.starts import cells_around_camera, for_each_start_at_camera
 from difftetvr.rendering.traversal.bundle import BundleRays
 
 Finder = Callable[[Callable[[Hit], None]], None]

@@ -10,10 +10,10 @@ import drjit as dr
 import torch
 
 from difftetvr.mesh import TetMesh
-from difftetvr.rendering.tracers.hierarchy import Hierarchy, SortedItems
-from difftetvr.rendering.tracers.hits import Hit
-from difftetvr.rendering.tracers.scene import Scene, boundary_half_faces
-from difftetvr.rendering.tracers.starts import NEAR, StartSearch
+from difftetvr.rendering.search.hierarchy import Hierarchy, SortedItems
+from difftetvr.rendering.search.hits import Hit
+from difftetvr.rendering.search.scene import Scene, boundary_half_faces
+from difftetvr.rendering.search.starts import NEAR, StartSearch
 from difftetvr.rendering.traversal.walk import crossing_depth, find_exit, holds_ray
 
 _FACES_OF_A_LEAF = 1
