@@ -37,7 +37,7 @@ class SortedItems:
     @staticmethod
     def of(items: torch.Tensor, corners: torch.Tensor, vertices: torch.Tensor) -> SortedItems:
         """Sort (N,) items with (N, K) corners by where their centres lie among (V, 3) vertices."""
-        order = _curve_order(vertices, corners)
+        order = curve_order(_centers(vertices, corners))
         return SortedItems(items[order].to(torch.int32), corners[order].to(torch.int32))
 
 
@@ -181,23 +181,25 @@ class Hierarchy:
         return dr.while_loop((root, state), lambda node, _: node != 0, body)[1]
 
 
-def _curve_order(vertices: torch.Tensor, corners: torch.Tensor) -> torch.Tensor:
-    """(N,) int64 permutation of items that brings those that are near each other together: a Morton curve.
-
-    Args:
-        vertices: (V, 3) positions.
-        corners: (N, K) vertices of each item.
-    """
+def curve_order(points: torch.Tensor) -> torch.Tensor:
+    """(N,) int64 permutation of (N, 3) points that brings those that are near each other together: a Morton curve."""
+    if not points.shape[0]:
+        return torch.zeros(0, dtype=torch.int64, device=points.device)
+    low, high = torch.aminmax(points, dim=0)
+    scale = ((1 << _CURVE_BITS) - 1) / (high - low).amax().clamp(min=torch.finfo(points.dtype).tiny)
     codes = []
-    positions = vertices.detach()
-    low, high = torch.aminmax(positions, dim=0)
-    scale = ((1 << _CURVE_BITS) - 1) / (high - low).amax().clamp(min=torch.finfo(positions.dtype).tiny)
-    for part in chunks(corners.shape[0], corners.device, width=4):
-        middle = sum(positions.index_select(0, column) for column in corners[part].unbind(1)) / corners.shape[1]
-        cells = ((middle - low) * scale).long().clamp(0, (1 << _CURVE_BITS) - 1)
+    for part in chunks(points.shape[0], points.device, width=4):
+        cells = ((points[part] - low) * scale).long().clamp(0, (1 << _CURVE_BITS) - 1)
         x, y, z = (_spread(column) for column in cells.unbind(1))
         codes.append(x | (y << 1) | (z << 2))
     return torch.argsort(torch.cat(codes))
+
+
+def _centers(vertices: torch.Tensor, corners: torch.Tensor) -> torch.Tensor:
+    """(N, 3) means of the corners of items."""
+    parts = [corners[part] for part in chunks(corners.shape[0], corners.device, width=4)]
+    sums = [sum(vertices.index_select(0, column) for column in part.unbind(1)) for part in parts]
+    return torch.cat(sums) / corners.shape[1]
 
 
 def _spread(values: torch.Tensor) -> torch.Tensor:
