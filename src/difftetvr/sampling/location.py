@@ -165,8 +165,9 @@ def locate_lattice(mesh: TetMesh, vertices: torch.Tensor, lattice: Lattice) -> t
         cell = backend.uints(owner)
         piece = dr.arange(uint, owner.shape[0]) - dr.gather(uint, backend.uints(begins), cell)
         take = lambda array: uint(dr.gather(integer, array, cell))  # noqa: E731
-        per, (x0, y0, z0), (_, height, depth) = take(per_item), map(take, low), map(take, extents)
-        last = dr.minimum((piece + 1) * per, take(extents[0]) * height)
+        per, (x0, y0, z0), (width, height, depth) = take(per_item), map(take, low), map(take, extents)
+        height = dr.maximum(height, 1)  # lanes without a piece divide by it, too
+        last = dr.minimum((piece + 1) * per, width * height)
         _, corners = reader.corners(cell)
 
         def body(column: Any, z: Any) -> tuple[Any, Any]:
