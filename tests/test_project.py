@@ -23,6 +23,7 @@ ALLOWED = {
     "mesh": GROUND,
     "optics": GROUND | {"backend"},
     "rendering": GROUND | {"backend", "mesh", "optics"},
+    "sampling": GROUND | {"backend", "mesh", "rendering"},
     "capture": GROUND | {"backend", "mesh", "optics", "rendering"},
     "fitting": GROUND | {"backend", "terminal", "mesh", "optics", "rendering", "capture"},
     "view": GROUND | {"backend", "mesh", "optics", "rendering", "capture", "fitting"},
@@ -32,7 +33,7 @@ ALLOWED = {
 `view` and `fitting` are one storey; of the two, the one that shows results may know what a result is, never the other.
 """
 
-MAY_TOUCH_DRJIT = {"backend", "optics", "rendering", "capture"}
+MAY_TOUCH_DRJIT = {"backend", "optics", "rendering", "sampling", "capture"}
 """Parts that hold kernels, or torch functions around them."""
 
 

@@ -7,6 +7,7 @@ from . import fitting as fitting
 from . import mesh as mesh
 from . import optics as optics
 from . import rendering as rendering
+from . import sampling as sampling
 from . import trust as trust
 from . import view as view
 from ._version import __version__ as __version__
@@ -41,6 +42,9 @@ from .rendering.cameras.parallel import ParallelCamera as ParallelCamera
 from .rendering.cameras.pinhole import Camera as Camera
 from .rendering.rays import Rays as Rays
 from .rendering.scalar_field import ScalarField as ScalarField
+from .sampling.isosurfaces import isosurface as isosurface
+from .sampling.probing import probe as probe
+from .sampling.voxels import voxelise as voxelise
 from .trust import trusting as trusting
 
 __all__ = [
@@ -70,11 +74,14 @@ __all__ = [
     "VolumeCapture",
     "__version__",
     "fit",
+    "isosurface",
     "load",
     "load_capture",
     "load_data",
     "load_mesh",
+    "probe",
     "render",
     "save",
     "trusting",
+    "voxelise",
 ]

@@ -61,7 +61,9 @@ class Interpolate(torch.autograd.Function):
             place = _Place.of(backend, ctx.mesh, vertices, points, cells)
             weights, slopes = place.weights()
             table, worth = backend.floats(values), backend.floats(gradient)
-            of_vertices, of_values, of_points = (dr.zeros(real, t.numel() if w else 1) for t, w in zip(likes, wanted, strict=True))
+            of_vertices, of_values, of_points = (
+                dr.zeros(real, t.numel() if w else 1) for t, w in zip(likes, wanted, strict=True)
+            )
             corner_worth = [real(0) for _ in range(4)]
             for channel in range(channels):
                 g = dr.gather(real, worth, channels * place.lane + channel, place.known)
@@ -72,7 +74,10 @@ class Interpolate(torch.autograd.Function):
                     if needs_values:
                         dr.scatter_add(of_values, g * weights[k], index, place.known)
             slope = [
-                sum((q * s[axis] for q, s in zip(corner_worth[1:], slopes[1:], strict=True)), corner_worth[0] * slopes[0][axis])
+                sum(
+                    (q * s[axis] for q, s in zip(corner_worth[1:], slopes[1:], strict=True)),
+                    corner_worth[0] * slopes[0][axis],
+                )
                 for axis in range(3)
             ]
             for axis in range(3):

@@ -15,9 +15,7 @@ from difftetvr.mesh.topology.topology import LOCAL_EDGE_OF
 from difftetvr.sampling.probing import checked_values
 
 
-def isosurface(
-    mesh: TetMesh, scalar: torch.Tensor, level: float | torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
+def isosurface(mesh: TetMesh, scalar: torch.Tensor, level: float | torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """The surface on which the linear interpolant of a scalar has a level.
 
     It is watertight but where it meets the boundary of the mesh. Vertices lie on edges of the mesh and are shared by

@@ -73,9 +73,7 @@ def checked_values(mesh: Any, values: Any, location: Location | None) -> tuple[t
     if not table.ndim:
         raise MeshError(f"The values are {shown(values)}; pass one for each vertex or cell.")
     if table.device != mesh.vertices.device:
-        raise MeshError(
-            f"The values are on '{table.device}', the mesh on '{mesh.vertices.device}'; move one of them."
-        )
+        raise MeshError(f"The values are on '{table.device}', the mesh on '{mesh.vertices.device}'; move one of them.")
     where = location_of(table.shape[0], location, mesh, f"There are {table.shape[0]} values")
     return table.reshape(table.shape[0], -1).to(mesh.vertices.dtype), where
 

@@ -101,4 +101,6 @@ def _refined(lattice: Lattice, first: int, count: int, samples: int, shift: Sequ
     step = tuple(s / samples for s in lattice.spacing)
     begin = [o - 0.5 * s + 0.5 * f - x for o, s, f, x in zip(lattice.origin, lattice.spacing, step, shift, strict=True)]
     begin[0] += first * lattice.spacing[0]
-    return Lattice((begin[0], begin[1], begin[2]), (step[0], step[1], step[2]), (count * samples, ny * samples, nz * samples))
+    return Lattice(
+        (begin[0], begin[1], begin[2]), (step[0], step[1], step[2]), (count * samples, ny * samples, nz * samples)
+    )
