@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -127,7 +128,9 @@ def load_points(path: Path) -> NDArray[Any]:
             points = read_arrays(path, MeshError, lambda name, _: name == "points")["points"]
         elif suffix in (".xyz", ".txt", ".csv"):
             delimiter = "," if suffix == ".csv" else None
-            points = np.loadtxt(path, delimiter=delimiter, usecols=(0, 1, 2), ndmin=2)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of a file without rows: see below
+                points = np.loadtxt(path, delimiter=delimiter, usecols=(0, 1, 2), ndmin=2)
         else:
             points = read_content(path).vertices
     except KeyError as error:
@@ -137,6 +140,8 @@ def load_points(path: Path) -> NDArray[Any]:
         raise MeshError(
             f"{path} cannot be read as points ({reason}); give .npy, .npz, .ply, .xyz, .txt or .csv."
         ) from error
+    if not points.size:
+        raise MeshError(f"{path} holds no points; give a file that does.")
     if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":
         raise MeshError(f"{path} holds {points.dtype} of shape {points.shape}; points must be numbers of shape (N, 3).")
     return points

@@ -28,7 +28,6 @@ import torch
 from numpy.typing import NDArray
 
 from difftetvr.errors import MeshError
-from difftetvr.mesh.io.formats.table import read_content
 from difftetvr.mesh.limits import MAX_CELLS
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.trust import require_regular
@@ -226,6 +225,8 @@ def load_surface(path: str | Path) -> Arrays:
     require_regular(path, MeshError)
     if not path.is_file():
         raise MeshError(f"There is no surface file {path}; check the path.")
+    from difftetvr.mesh.io.formats.table import read_content  # late: readers need what is made here
+
     content = read_content(path)
     blocks = [_triangles(path, block.kind, np.asarray(block.nodes)) for block in content.cells]
     found = [block for block in blocks if len(block)]

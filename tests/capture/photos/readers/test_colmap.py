@@ -210,6 +210,18 @@ def test_cut_files_name_the_file(tmp_path: Path) -> None:
         path.write_bytes(data)
 
 
+@pytest.mark.parametrize("number", ["nan", "1e300", "-inf"])
+def test_numbers_of_points_are_numbers(tmp_path: Path, number: str) -> None:
+    write_colmap(tmp_path, ".txt")
+    path = tmp_path / "sparse" / "0" / "images.txt"
+    lines = path.read_text().split("\n")
+    row = next(index for index, line in enumerate(lines) if line and not line.startswith("#"))
+    lines[row + 1] = f"1.5 2.5 {number}"
+    path.write_text("\n".join(lines))
+    with pytest.raises(CaptureError, match=f"damaged .*line {row + 2 - 1} cannot be read"):
+        load_capture(tmp_path)
+
+
 def test_models_of_other_images_are_refused(tmp_path: Path) -> None:
     values = {**CAMERA, "cx": -400.0}
     write_colmap(tmp_path, ".txt", parameters=tuple(values.values()))

@@ -69,6 +69,7 @@ def test_wrong_files_of_the_apps(tmp_path: Path) -> None:
         ({"poses": [[1, 2, 3]]}, "seven numbers"),
         ({"poses": [[0, 0, 0, 1, 0, 0, 10**400]]}, "seven numbers"),
         ({"poses": [[0, 0, 0, 2, 0, 0, 0]] * 3}, "Pose 0 .* no rotation"),
+        ({"poses": [[0, 0, 0, 1e200, 0, 0, 0]] * 3}, "Pose 0 .* no rotation"),
         ({"K": None}, "no intrinsics"),
         ({"w": 0.5}, "whole number of pixels"),
     ):

@@ -99,9 +99,9 @@ class ColmapModel:
             place = np.searchsorted(ids, image.point_ids).clip(0, max(len(ids) - 1, 0))
             known = (ids[place] == image.point_ids) if len(ids) else np.zeros(len(image.point_ids), dtype=bool)
             pose, lens = image.world_to_camera, self.cameras[image.camera_id]
-            points = positions[place[known]] @ pose[:3, :3].T + pose[:3, 3]
             intrinsics = lens.on(lens.width or 1, lens.height or 1, f"'{image.name}'")
             with np.errstate(all="ignore"):
+                points = positions[place[known]] @ pose[:3, :3].T + pose[:3, 3]
                 distances = np.linalg.norm(intrinsics.project(points) - image.keypoints[known], axis=1)
             errors.append(np.where((points[:, 2] > 0) & np.isfinite(distances), distances, np.inf))
         return np.concatenate(errors)

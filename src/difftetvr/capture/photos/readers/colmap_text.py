@@ -17,6 +17,8 @@ from difftetvr.capture.photos.readers.colmap_model import ColmapImage, ColmapPoi
 from difftetvr.errors import CaptureError
 from difftetvr.trust import require_regular
 
+_LARGEST_ID = 2.0**53  # float64 counts no further
+
 
 def read_cameras(path: Path) -> dict[int, Lens]:
     """Lenses by key.
@@ -60,8 +62,15 @@ def read_images(path: Path) -> list[ColmapImage]:
             quaternion, translation = (np.array(part, dtype=np.float64) for part in (pose[:4], pose[4:]))
             keypoints = np.array(features.split(), dtype=np.float64).reshape(-1, 3)
             rigid = from_quaternion(quaternion, translation, f"image '{name}' of '{path}'")
-            images.append(ColmapImage(name, int(camera), rigid, keypoints[:, :2], keypoints[:, 2].astype(np.int64)))
+            images.append(ColmapImage(name, int(camera), rigid, keypoints[:, :2], _point_ids(keypoints[:, 2])))
     return images
+
+
+def _point_ids(values: np.ndarray) -> np.ndarray:
+    """Numbers of sparse points, -1 for none."""
+    if not (np.abs(values) < _LARGEST_ID).all():
+        raise ValueError
+    return values.astype(np.int64)
 
 
 def read_points(path: Path) -> ColmapPoints:

@@ -68,7 +68,8 @@ def read_record3d(folder: Path) -> PhotoSet:
     poses = numbers_of(content.get("poses"))
     if poses.ndim != 2 or poses.shape[1] != 7 or not len(poses) or not np.isfinite(poses).all():
         raise CaptureError(f"'poses' of '{file}' is no list of seven numbers for each image; export it anew.")
-    lengths = np.linalg.norm(poses[:, :4], axis=1)
+    with np.errstate(over="ignore"):
+        lengths = np.linalg.norm(poses[:, :4], axis=1)
     if not (np.abs(lengths - 1.0) < 0.01).all():
         raise CaptureError(f"Pose {int(np.abs(lengths - 1.0).argmax())} of '{file}' is no rotation; export it anew.")
     matrices = np.concatenate([Rotation.from_quat(poses[:, :4]).as_matrix(), poses[:, 4:, None]], axis=2)
