@@ -37,7 +37,7 @@ def brute_force(mesh: TetMesh, points: Tensor) -> tuple[Tensor, Tensor]:
 def test_values_are_those_of_brute_force() -> None:
     mesh = bent_mesh()
     generator = torch.Generator().manual_seed(7)
-    points = 1.4 * torch.rand(3000, 3, generator=generator, dtype=torch.float64) - 0.2
+    points = torch.rand(3000, 3, generator=generator, dtype=torch.float64)
     values = torch.rand(mesh.num_vertices, 3, generator=generator, dtype=torch.float64)
     weights, clear = brute_force(mesh, points)
     inside = weights.amin(2) >= 0
@@ -128,7 +128,7 @@ def test_rays_see_what_probes_find() -> None:
     [
         ({"values": torch.rand(7)}, "There are 7 values, but this mesh needs"),
         ({"values": torch.tensor(1.0)}, "pass one for each vertex or cell"),
-        ({"values": "density"}, "The values is 'density'|The values are|values"),
+        ({"values": "density"}, "The values is 'density'"),
         ({"values": Field(torch.rand(27, 3), torch.rand(27))}, r"values is a Field; .*field\.density"),
         ({"points": torch.rand(5, 2)}, r"points have shape \(5, 2\)"),
         ({"points": torch.full((2, 3), math.nan)}, "point is not finite"),

@@ -61,9 +61,8 @@ class Interpolate(torch.autograd.Function):
             place = _Place.of(backend, ctx.mesh, vertices, points, cells)
             weights, slopes = place.weights()
             table, worth = backend.floats(values), backend.floats(gradient)
-            of_vertices, of_values, of_points = (
-                dr.zeros(real, t.numel() if w else 1) for t, w in zip(likes, wanted, strict=True)
-            )
+            sizes = (like.numel() if want else 1 for like, want in zip(likes, wanted, strict=True))
+            of_vertices, of_values, of_points = (dr.zeros(real, size) for size in sizes)
             corner_worth = [real(0) for _ in range(4)]
             for channel in range(channels):
                 g = dr.gather(real, worth, channels * place.lane + channel, place.known)
@@ -73,13 +72,7 @@ class Interpolate(torch.autograd.Function):
                     corner_worth[k] = dr.fma(g, value, corner_worth[k])
                     if needs_values:
                         dr.scatter_add(of_values, g * weights[k], index, place.known)
-            slope = [
-                sum(
-                    (q * s[axis] for q, s in zip(corner_worth[1:], slopes[1:], strict=True)),
-                    corner_worth[0] * slopes[0][axis],
-                )
-                for axis in range(3)
-            ]
+            slope = [_dot(corner_worth, [row[axis] for row in slopes]) for axis in range(3)]
             for axis in range(3):
                 if needs_points:
                     dr.scatter(of_points, dr.select(place.known, slope[axis], 0.0), 3 * place.lane + axis)
@@ -114,7 +107,7 @@ class _Place:
         weights, _ = self.reader.weights(self.corners, self.point)
         edges = [[x - y for x, y in zip(corner, self.corners[0], strict=True)] for corner in self.corners[1:]]
         normals = [_cross(edges[1], edges[2]), _cross(edges[2], edges[0]), _cross(edges[0], edges[1])]
-        volume = sum((e * n for e, n in zip(edges[0][1:], normals[0][1:], strict=True)), edges[0][0] * normals[0][0])
+        volume = _dot(edges[0], normals[0])
         inverse = dr.select(volume != 0, 1.0 / volume, 0.0)
         slopes = [[n * inverse for n in normal] for normal in normals]
         first = [-(slopes[0][axis] + slopes[1][axis] + slopes[2][axis]) for axis in range(3)]
@@ -123,3 +116,10 @@ class _Place:
 
 def _cross(a: list[Any], b: list[Any]) -> list[Any]:
     return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+
+
+def _dot(a: list[Any], b: list[Any]) -> Any:
+    total = a[0] * b[0]
+    for x, y in zip(a[1:], b[1:], strict=True):
+        total = dr.fma(x, y, total)
+    return total

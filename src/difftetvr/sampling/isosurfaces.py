@@ -18,8 +18,8 @@ from difftetvr.sampling.probing import checked_values
 def isosurface(mesh: TetMesh, scalar: torch.Tensor, level: float | torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """The surface on which the linear interpolant of a scalar has a level.
 
-    It is watertight but where it meets the boundary of the mesh. Vertices lie on edges of the mesh and are shared by
-    triangles; they are differentiable in ``scalar``, ``level`` and ``mesh.vertices``, which triangles joins them is not.
+    It is watertight but where it meets the boundary of the mesh. Vertices lie on edges of the mesh, are shared by
+    triangles and are differentiable in ``scalar``, ``level`` and ``mesh.vertices``; how these join them is not.
 
     Args:
         mesh: The mesh, of joined or loose cells.

@@ -10,7 +10,7 @@ import torch
 from difftetvr.errors import MeshError, shown
 from difftetvr.inputs import as_number, as_reals, require_type
 from difftetvr.mesh import Field, TetMesh
-from difftetvr.mesh.field import Location, location_of
+from difftetvr.mesh.field import Location, location_of, require_location
 from difftetvr.sampling.interpolation import Interpolate
 from difftetvr.sampling.location import locate
 
@@ -52,12 +52,7 @@ def probe(
     cells = locate(mesh, like.detach(), local.detach())
     found = interpolated(mesh, table, where, local, cells)
     found = torch.where((cells >= 0)[:, None], found, filler)
-    return found.reshape(*places.shape[:-1], *table.shape[1:] if values_have_channels(values) else ())
-
-
-def values_have_channels(values: Any) -> bool:
-    """Whether values are more than one number each."""
-    return as_reals(values, "The values", MeshError).ndim > 1
+    return found.reshape((*places.shape[:-1], *as_reals(values, "The values", MeshError).shape[1:]))
 
 
 def checked_values(mesh: Any, values: Any, location: Location | None) -> tuple[torch.Tensor, Location]:
@@ -74,6 +69,7 @@ def checked_values(mesh: Any, values: Any, location: Location | None) -> tuple[t
         raise MeshError(f"The values are {shown(values)}; pass one for each vertex or cell.")
     if table.device != mesh.vertices.device:
         raise MeshError(f"The values are on '{table.device}', the mesh on '{mesh.vertices.device}'; move one of them.")
+    require_location(location, "location")
     where = location_of(table.shape[0], location, mesh, f"There are {table.shape[0]} values")
     return table.reshape(table.shape[0], -1).to(mesh.vertices.dtype), where
 

@@ -92,15 +92,15 @@ def _lattice(origin: Any, spacing: Any, shape: Any, samples: Any) -> tuple[Latti
         raise MeshError(f"shape is {shown(shape)}; pass three numbers of voxels, at most {MOST_VOXELS:,} in all.")
     if not 1 <= samples <= 16:
         raise MeshError(f"samples is {samples}; pass a number from 1 to 16.")
-    return Lattice(tuple(first), tuple(step), tuple(counts)), samples
+    (x, y, z), (dx, dy, dz), (nx, ny, nz) = first, step, counts
+    return Lattice((x, y, z), (dx, dy, dz), (nx, ny, nz)), samples
 
 
 def _refined(lattice: Lattice, first: int, count: int, samples: int, shift: Sequence[float]) -> Lattice:
     """Sample points of some of a grid's first coordinates, relative to a mesh's origin."""
     _, ny, nz = lattice.shape
-    step = tuple(s / samples for s in lattice.spacing)
-    begin = [o - 0.5 * s + 0.5 * f - x for o, s, f, x in zip(lattice.origin, lattice.spacing, step, shift, strict=True)]
-    begin[0] += first * lattice.spacing[0]
-    return Lattice(
-        (begin[0], begin[1], begin[2]), (step[0], step[1], step[2]), (count * samples, ny * samples, nz * samples)
-    )
+    fine = [step / samples for step in lattice.spacing]
+    steps = zip(lattice.origin, lattice.spacing, fine, shift, strict=True)
+    x, y, z = (start - 0.5 * step + 0.5 * part - own for start, step, part, own in steps)
+    begin = x + first * lattice.spacing[0]
+    return Lattice((begin, y, z), (fine[0], fine[1], fine[2]), (count * samples, ny * samples, nz * samples))

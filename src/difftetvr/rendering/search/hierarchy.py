@@ -197,9 +197,10 @@ def curve_order(points: torch.Tensor) -> torch.Tensor:
 
 def _centers(vertices: torch.Tensor, corners: torch.Tensor) -> torch.Tensor:
     """(N, 3) means of the corners of items."""
-    parts = [corners[part] for part in chunks(corners.shape[0], corners.device, width=4)]
-    sums = [sum(vertices.index_select(0, column) for column in part.unbind(1)) for part in parts]
-    return torch.cat(sums) / corners.shape[1]
+    sums = vertices.index_select(0, corners[:, 0])
+    for column in corners[:, 1:].unbind(1):
+        sums += vertices.index_select(0, column)
+    return sums / corners.shape[1]
 
 
 def _spread(values: torch.Tensor) -> torch.Tensor:
