@@ -56,10 +56,11 @@ class Field:
         if self.harmonics is not None:
             harmonics = as_reals(self.harmonics, "The field's harmonics", MeshError)
             counts = {(len(color), count, 3) for count in COUNTS[1:]}
-            if tuple(harmonics.shape) not in counts:
+            if tuple(harmonics.shape) not in counts or color.shape[1] != 3:
                 raise MeshError(
-                    f"The field's harmonics have shape {tuple(harmonics.shape)}; pass ({len(color)}, B, 3) with B one "
-                    f"of {', '.join(str(count) for count in COUNTS[1:])}."
+                    f"The field's harmonics have shape {tuple(harmonics.shape)} and its color {tuple(color.shape)}; "
+                    f"pass ({len(color)}, B, 3) with B one of {', '.join(str(count) for count in COUNTS[1:])}, and "
+                    "three colours."
                 )
             object.__setattr__(self, "harmonics", harmonics)
         object.__setattr__(self, "color", color)
