@@ -14,7 +14,19 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "src" / "difftetvr"
 SOURCES = sorted(PACKAGE.rglob("*.py"))
 
-GROUND = {"_lazy", "_version", "archive", "errors", "files", "inputs", "interrupts", "libllvm", "trust", "vtk_xml"}
+GROUND = {
+    "_lazy",
+    "_version",
+    "archive",
+    "errors",
+    "files",
+    "inputs",
+    "interrupts",
+    "libcuda",
+    "libllvm",
+    "trust",
+    "vtk_xml",
+}
 """Modules that import nothing of this package but each other."""
 
 ALLOWED = {
