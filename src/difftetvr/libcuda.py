@@ -1,8 +1,8 @@
 """Whether Dr.Jit finds the CUDA driver that this machine has.
 
-Dr.Jit asks the loader for ``libcuda.so``, a name that only development packages and some drivers install. Containers and
-many clusters have ``libcuda.so.1`` alone, and Dr.Jit would take the CPU without a word. This module tells it by the
-environment variable ``DRJIT_LIBCUDA_PATH``, which Dr.Jit reads once, when it is first imported.
+Dr.Jit asks the loader for ``libcuda.so``, a name that only development packages and some drivers install. Containers
+and many clusters have ``libcuda.so.1`` alone, and Dr.Jit would take the CPU without a word. This module tells it by
+the environment variable ``DRJIT_LIBCUDA_PATH``, which Dr.Jit reads once, when it is first imported.
 """
 
 from __future__ import annotations
