@@ -15,7 +15,8 @@ PACKAGE = ROOT / "src" / "difftetvr"
 SOURCES = sorted(PACKAGE.rglob("*.py"))
 
 GROUND = {
-    *("_lazy", "_version", "archive", "declared", "errors", "files", "inputs", "interrupts", "libllvm", "trust"),
+    *("_lazy", "_version", "archive", "declared", "errors", "files", "inputs", "interrupts", "libcuda", "libllvm"),
+    "trust",
     "vtk_xml",
 }
 """Modules that import nothing of this package but each other."""
@@ -26,6 +27,7 @@ ALLOWED = {
     "mesh": GROUND,
     "optics": GROUND | {"backend"},
     "rendering": GROUND | {"backend", "mesh", "optics"},
+    "sampling": GROUND | {"backend", "mesh", "rendering"},
     "capture": GROUND | {"backend", "mesh", "optics", "rendering"},
     "fitting": GROUND | {"backend", "terminal", "mesh", "optics", "rendering", "capture"},
     "view": GROUND | {"backend", "mesh", "optics", "rendering", "capture", "fitting"},
@@ -35,7 +37,7 @@ ALLOWED = {
 `view` and `fitting` are one storey; of the two, the one that shows results may know what a result is, never the other.
 """
 
-MAY_TOUCH_DRJIT = {"backend", "optics", "rendering", "capture"}
+MAY_TOUCH_DRJIT = {"backend", "optics", "rendering", "sampling", "capture"}
 """Parts that hold kernels, or torch functions around them."""
 
 

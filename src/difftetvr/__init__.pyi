@@ -7,6 +7,7 @@ from . import fitting as fitting
 from . import mesh as mesh
 from . import optics as optics
 from . import rendering as rendering
+from . import sampling as sampling
 from . import trust as trust
 from . import view as view
 from ._version import __version__ as __version__
@@ -34,8 +35,16 @@ from .mesh.tetmesh import TetMesh as TetMesh
 from .optics.transfer_function import TransferFunction as TransferFunction
 from .rendering.api import RenderedImage as RenderedImage
 from .rendering.api import render as render
+from .rendering.cameras.detector import Detector as Detector
+from .rendering.cameras.lens import LensCamera as LensCamera
+from .rendering.cameras.panoramic import PanoramicCamera as PanoramicCamera
+from .rendering.cameras.parallel import ParallelCamera as ParallelCamera
 from .rendering.cameras.pinhole import Camera as Camera
+from .rendering.rays import Rays as Rays
 from .rendering.scalar_field import ScalarField as ScalarField
+from .sampling.isosurfaces import isosurface as isosurface
+from .sampling.probing import probe as probe
+from .sampling.voxels import voxelise as voxelise
 from .trust import trusting as trusting
 
 __all__ = [
@@ -44,14 +53,19 @@ __all__ = [
     "CameraError",
     "Capture",
     "CaptureError",
+    "Detector",
     "DiffTetError",
     "Field",
     "FitConfig",
     "FitError",
     "FitResult",
+    "LensCamera",
     "MeshData",
     "MeshError",
+    "PanoramicCamera",
+    "ParallelCamera",
     "PhotoCapture",
+    "Rays",
     "RenderedImage",
     "ScalarField",
     "TetMesh",
@@ -60,11 +74,14 @@ __all__ = [
     "VolumeCapture",
     "__version__",
     "fit",
+    "isosurface",
     "load",
     "load_capture",
     "load_data",
     "load_mesh",
+    "probe",
     "render",
     "save",
     "trusting",
+    "voxelise",
 ]

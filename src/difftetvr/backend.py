@@ -12,6 +12,7 @@ import os
 import platform
 import sys
 import threading
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -20,10 +21,11 @@ from typing import Any, ParamSpec, TypeVar
 
 import torch
 
+from difftetvr import libcuda, libllvm
 from difftetvr.errors import BackendError, shown
-from difftetvr.libllvm import PATH_VARIABLE, tell_drjit
 
-tell_drjit()  # before the first import of Dr.Jit, which looks for libLLVM only then
+for library in (libllvm, libcuda):
+    library.tell_drjit()  # before the first import of Dr.Jit, which looks for them only then
 
 import drjit as dr  # noqa: E402
 
@@ -33,7 +35,12 @@ Result = TypeVar("Result")
 _DEVICE_BACKENDS = {"cpu": "llvm", "cuda": "cuda", "mps": "metal"}
 _TURN = threading.RLock()
 _FORKED = threading.Event()  # set in copies of a process in which kernels had run
+_PACKET_BYTES = 16
 _DTYPES = {torch.float32: "", torch.float64: "64"}
+
+
+class BackendWarning(UserWarning):
+    """Something runs slower, or repeats less exactly, than this machine or the caller would have it."""
 
 
 @dataclass(frozen=True)
@@ -76,13 +83,11 @@ class Backend:
 
         Compute what depends on the view with :meth:`run` before the tensor may go away.
         """
-        self._await_torch()
-        return self.Float(tensor.detach().to(self.dtype).contiguous().reshape(-1))
+        return self.Float(self._ready(tensor.detach().to(self.dtype)))
 
     def uints(self, tensor: torch.Tensor) -> Any:
         """Flat Dr.Jit view of an int32 tensor as unsigned integers, likewise: -1 becomes 0xFFFFFFFF."""
-        self._await_torch()
-        return self.UInt(tensor.detach().to(torch.int32).contiguous().reshape(-1).view(torch.uint32))
+        return self.UInt(self._ready(tensor.detach().to(torch.int32)).view(torch.uint32))
 
     def opaque(self, value: float) -> Any:
         """A scalar as a device value, so that kernels need no recompilation when it changes."""
@@ -122,6 +127,13 @@ class Backend:
         """
         require_own_threads()
         _watch_forks()
+        if one_thread and self.name != "llvm":
+            warnings.warn(
+                f"deterministic=True does not reach the {self.name} kernels: gradients add up in an order that changes "
+                "from run to run; pass deterministic=False, or move the tensors to the CPU.",
+                BackendWarning,
+                stacklevel=2,
+            )
         with _TURN:
             threads = dr.thread_count() if one_thread and self.name == "llvm" else 0
             if threads:
@@ -133,10 +145,17 @@ class Backend:
                     dr.sync_thread()
                     dr.set_thread_count(threads)
 
-    def _await_torch(self) -> None:
-        # Torch and Dr.Jit run on streams of their own.
+    def _ready(self, tensor: torch.Tensor) -> torch.Tensor:
+        """A tensor's values as kernels can read them: flat, where packets may begin, and written."""
+        flat = tensor.contiguous().reshape(-1)
         if self.name == "cuda":
-            torch.cuda.current_stream(self.device).synchronize()
+            if flat.data_ptr() % _PACKET_BYTES:
+                flat = flat.clone()  # loads of whole packets fault on views that begin in the midst of one
+            # Dr.Jit's stream and torch's default one wait for each other; torch's side streams do not.
+            stream = torch.cuda.current_stream(self.device)
+            if stream != torch.cuda.default_stream(self.device):
+                stream.synchronize()
+        return flat
 
 
 def eager(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
@@ -187,6 +206,11 @@ def _started_backend(device: str, dtype: torch.dtype) -> Backend:
     name = _DEVICE_BACKENDS.get(torch_device.type)
     if name is None:
         raise BackendError(f"Device '{device}' has no Dr.Jit back end; move the tensors to 'cpu', 'cuda' or 'mps'.")
+    if name == "cuda" and (torch_device.index or 0) > 0:
+        raise BackendError(
+            f"Kernels run on the first GPU alone, and the tensors are on '{torch_device}'; start one process for each "
+            f"GPU, this one with CUDA_VISIBLE_DEVICES={torch_device.index}, and use 'cuda:0' in it."
+        )
     if dtype not in _DTYPES or (name == "metal" and dtype == torch.float64):
         raise BackendError(f"The {name} kernels cannot run in {dtype}; convert the tensors to torch.float32.")
     if not dr.has_backend(getattr(dr.JitBackend, {"llvm": "LLVM", "cuda": "CUDA", "metal": "Metal"}[name])):
@@ -219,8 +243,9 @@ def default_device() -> torch.device:
         try:
             get_backend(device)
             return torch.device(device)
-        except BackendError:
-            continue
+        except BackendError as error:
+            if device != "cpu":
+                warnings.warn(f"The GPU is left unused: {error}", BackendWarning, stacklevel=2)
     raise BackendError(_missing_backend("llvm"))
 
 
@@ -290,7 +315,7 @@ def backend_states() -> list[BackendState]:
 def _description(name: str) -> str:
     if name == "llvm":
         version = ".".join(str(number) for number in dr.detail.llvm_version())
-        library = os.environ.get(PATH_VARIABLE, "found by Dr.Jit itself")
+        library = os.environ.get(libllvm.PATH_VARIABLE, "found by Dr.Jit itself")
         return f"LLVM {version} ({library}), {dr.thread_count()} threads; PyTorch has {torch.get_num_threads()}"
     if name == "cuda":
         if not torch.cuda.is_available():
@@ -303,7 +328,10 @@ def _description(name: str) -> str:
 
 def _missing_backend(name: str) -> str:
     if name == "cuda":
-        return "The CUDA back end cannot start: update the NVIDIA driver, or move the tensors to the CPU."
+        return (
+            "The CUDA back end cannot start although PyTorch's can: Dr.Jit finds no driver library that it can use; "
+            f"name libcuda.so.1 in {libcuda.PATH_VARIABLE}, update the NVIDIA driver, or move the tensors to the CPU."
+        )
     if name == "metal":
         return "The Metal back end cannot start on this system; move the tensors to the CPU."
     return f"The CPU back end needs a system libLLVM of version 15 or newer and found none: run `{_llvm_command()}`."

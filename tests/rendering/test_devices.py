@@ -3,6 +3,8 @@
 import pytest
 import torch
 
+from difftetvr.backend import BackendWarning, default_device, dr, get_backend
+from difftetvr.errors import BackendError
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.rendering import Camera, render
 
@@ -36,3 +38,18 @@ def test_cuda_agrees_with_the_cpu(name: str, dtype: torch.dtype) -> None:
     )
     for cpu, cuda in results:
         assert (cpu - cuda).norm() <= tolerance * cpu.norm()
+
+
+def test_other_gpus_than_the_first_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Dr.Jit knows the first one only; a picture of the wrong memory would be no error."""
+    with pytest.raises(BackendError, match=r"'cuda:1'; start one process .* CUDA_VISIBLE_DEVICES=1"):
+        get_backend("cuda:1")
+
+
+def test_a_gpu_that_is_left_unused_is_told_of(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("difftetvr.backend._present_devices", lambda: ["cuda", "cpu"])
+    if dr.has_backend(dr.JitBackend.CUDA):
+        assert default_device().type == "cuda"
+        return
+    with pytest.warns(BackendWarning, match="GPU is left unused: The CUDA back end cannot start .*DRJIT_LIBCUDA_PATH"):
+        assert default_device().type == "cpu"

@@ -41,7 +41,6 @@ BAD_FIELDS: dict[str, Callable[[Field], Field]] = {
     "NaN density": lambda f: Field(f.color, _with(f.density, (3,), math.nan)),
     "infinite density": lambda f: Field(f.color, _with(f.density, (3,), math.inf)),
     "negative density": lambda f: Field(f.color, _with(f.density, (3,), -0.1)),
-    "four channels": lambda f: Field(torch.cat([f.color, f.color[:, :1]], dim=1), f.density),
     "lengths that differ": lambda f: Field(f.color, f.density[:2]),
     "matrix of densities": lambda f: Field(f.color, f.density[:, None]),
 }

@@ -12,11 +12,20 @@ import pytest
 import torch
 from rendering.helpers import assert_sentence
 
-from difftetvr.errors import CameraError, DiffTetError
+from difftetvr.errors import DiffTetError
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.mesh.io import load, load_data, load_mesh
 from difftetvr.optics import ExactLinear, SubSegments, TransferFunction
-from difftetvr.rendering import Camera, ScalarField, render
+from difftetvr.rendering import (
+    Camera,
+    Detector,
+    LensCamera,
+    PanoramicCamera,
+    ParallelCamera,
+    Rays,
+    ScalarField,
+    render,
+)
 from difftetvr.rendering.gauss_newton import model_image
 from difftetvr.rendering.inspection import inspect_rays
 
@@ -55,6 +64,27 @@ CALLS: dict[str, tuple[Callable[..., Any], dict[str, Any], tuple[str, ...]]] = {
     ),
     "Camera": (Camera, {**POSE, "width": 8, "height": 8}, (*POSE, "width", "height")),
     "look_at": (Camera.look_at, {"eye": (1, 2, 3), "target": (0, 0, 0)}, ("eye", "target", "up", "fov_y", "width")),
+    "Rays": (
+        Rays,
+        {"origins": (0, 0, 0), "directions": (0, 0, 1)},
+        ("origins", "directions", "near", "far"),
+    ),
+    "LensCamera": (LensCamera, {**POSE, "width": 8, "height": 8}, ("model", "coefficients", "fx", "width")),
+    "ParallelCamera": (
+        ParallelCamera,
+        {"world_to_camera": torch.eye(4), "pixel_size": 0.1, "width": 8, "height": 8},
+        ("world_to_camera", "pixel_size", "width", "height", "near"),
+    ),
+    "PanoramicCamera": (
+        PanoramicCamera,
+        {"world_to_camera": torch.eye(4), "width": 8, "height": 8},
+        ("world_to_camera", "width", "height"),
+    ),
+    "Detector": (
+        Detector,
+        {"center": (0, 0, 0), "columns": (1, 0, 0), "rows": (0, 1, 0), "width": 8, "height": 8, "source": (0, 0, 9)},
+        ("center", "columns", "rows", "width", "height", "source"),
+    ),
     "with_size": (CAMERA.with_size, {"width": 8, "height": 8}, ("width", "height")),
     "with_pose": (CAMERA.with_pose, {}, ("world_to_camera",)),
     "to_camera_space": (CAMERA.to_camera_space, {}, ("points",)),
@@ -74,7 +104,12 @@ CALLS: dict[str, tuple[Callable[..., Any], dict[str, Any], tuple[str, ...]]] = {
     "SubSegments": (SubSegments, {}, ("count",)),
 }
 ACCEPTED = {
-    # What is no junk in these places: scalars may be arrays or tensors of any shape.
+    # What is no junk in these places: scalars may be arrays or tensors of any shape, views may be many.
+    ("render", "camera"): ("cameras",),
+    ("Rays", "origins"): ("tensor",),
+    ("Rays", "directions"): ("tensor",),
+    ("Rays", "near"): ("tensor",),
+    ("Rays", "far"): ("tensor",),
     ("TransferFunction()", "scalar"): ("tensor",),
 }
 
@@ -94,7 +129,13 @@ def test_junk_is_refused_in_one_sentence(call: str, name: str) -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"camera": [CAMERA, CAMERA]}, "camera is .*Camera.*; pass one"),
+        ({"camera": [CAMERA, None]}, r"camera is .*Camera.*; pass a difftetvr\.Camera, a list"),
+        ({"camera": CAMERA.world_to_camera}, r"camera is a tensor .*; pass a difftetvr\.Camera, a list"),
+        ({"background": (0.1, 0.2)}, r"background is \(0.1, 0.2\); give three finite"),
+        (
+            {"field": Field(FIELD.color[:, :2], FIELD.density), "background": (0.1,)},
+            "one finite number for each of 2",
+        ),
         ({"field": [FIELD, FIELD]}, "field is .*Field.*; pass one"),
         ({"field": FIELD.color}, "field is a tensor"),
         ({"field": None}, "field is None"),
@@ -145,10 +186,13 @@ def test_hats_need_a_field() -> None:
 
 
 @pytest.mark.parametrize("name", ["fx", "fy", "cx", "cy"])
-def test_intrinsics_that_require_a_gradient_are_refused(name: str) -> None:
-    """Taking their value would drop the gradient without a word."""
-    with pytest.raises(CameraError, match=rf"{name} requires a gradient.*; pass float\({name}.detach\(\)\)"):
-        Camera(**{**POSE, name: torch.tensor(9.0, requires_grad=True)}, width=8, height=8)
+def test_intrinsics_that_require_a_gradient_get_one(name: str) -> None:
+    value = torch.tensor(4.5, requires_grad=True)
+    camera = Camera(**{**POSE, name: value}, width=8, height=8).with_size(16, 8).with_pose(CAMERA.world_to_camera)
+    render(MESH, FIELD, camera).color.sum().backward()
+    assert value.grad is not None
+    assert float(value.grad) != 0.0
+    assert Camera(**{**POSE, name: value.detach()}, width=8, height=8).intrinsics is None
 
 
 def test_arrays_lists_and_scalars_of_numpy_are_taken() -> None:

@@ -14,13 +14,16 @@ from difftetvr.mesh.tetmesh import TetMesh
 
 Location = Literal["vertex", "cell"]
 
+MOST_CHANNELS = 64
+
 
 @dataclass(frozen=True, eq=False)
 class Field:
     """What a mesh emits and absorbs: linear between its vertices, or constant in each cell.
 
     Attributes:
-        color: (V, 3) per vertex or (T, 3) per cell; emitted linear RGB, float32 or float64, may require grad.
+        color: (V, C) per vertex or (T, C) per cell; emitted linear RGB, or any other 0 to 64 channels, which may be
+            negative; float32 or float64, may require grad.
         density: (V,) or (T,) extinction per unit length, >= 0, of the same length; may require grad.
         location: "vertex" or "cell"; None lets the lengths decide, vertices first where both fit.
         harmonics: (V, B, 3) or (T, B, 3) coefficients of the spherical harmonics that are added to ``color``, with B 3,
@@ -39,8 +42,11 @@ class Field:
     def __post_init__(self) -> None:
         color = as_reals(self.color, "The field's color", MeshError)
         density = as_reals(self.density, "The field's density", MeshError)
-        if color.ndim != 2 or color.shape[1] != 3:
-            raise MeshError(f"The field's color has shape {tuple(color.shape)}; pass linear RGB of shape (N, 3).")
+        if color.ndim != 2 or color.shape[1] > MOST_CHANNELS:
+            raise MeshError(
+                f"The field's color has shape {tuple(color.shape)}; pass linear RGB of shape (N, 3), or (N, C) with up "
+                f"to {MOST_CHANNELS} channels."
+            )
         if density.shape != color.shape[:1]:
             raise MeshError(
                 f"The field's density has shape {tuple(density.shape)} and its color {tuple(color.shape)}; "
@@ -50,10 +56,11 @@ class Field:
         if self.harmonics is not None:
             harmonics = as_reals(self.harmonics, "The field's harmonics", MeshError)
             counts = {(len(color), count, 3) for count in COUNTS[1:]}
-            if tuple(harmonics.shape) not in counts:
+            if tuple(harmonics.shape) not in counts or color.shape[1] != 3:
                 raise MeshError(
-                    f"The field's harmonics have shape {tuple(harmonics.shape)}; pass ({len(color)}, B, 3) with B one "
-                    f"of {', '.join(str(count) for count in COUNTS[1:])}."
+                    f"The field's harmonics have shape {tuple(harmonics.shape)} and its color {tuple(color.shape)}; "
+                    f"pass ({len(color)}, B, 3) with B one of {', '.join(str(count) for count in COUNTS[1:])}, and "
+                    "three colours."
                 )
             object.__setattr__(self, "harmonics", harmonics)
         object.__setattr__(self, "color", color)

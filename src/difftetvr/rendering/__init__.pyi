@@ -5,13 +5,32 @@ from . import clip_plane as clip_plane
 from . import gauss_newton as gauss_newton
 from . import inspection as inspection
 from . import kernels as kernels
+from . import preparation as preparation
+from . import rays as rays
 from . import scalar_field as scalar_field
+from . import search as search
 from . import tracers as tracers
 from . import traversal as traversal
 from .api import RenderedImage as RenderedImage
 from .api import render as render
+from .cameras.detector import Detector as Detector
+from .cameras.lens import LensCamera as LensCamera
+from .cameras.panoramic import PanoramicCamera as PanoramicCamera
+from .cameras.parallel import ParallelCamera as ParallelCamera
 from .cameras.pinhole import Camera as Camera
+from .rays import Rays as Rays
 from .scalar_field import ScalarField as ScalarField
 from .tracers.projected import OrderWarning as OrderWarning
 
-__all__ = ["Camera", "OrderWarning", "RenderedImage", "ScalarField", "render"]
+__all__ = [
+    "Camera",
+    "Detector",
+    "LensCamera",
+    "OrderWarning",
+    "PanoramicCamera",
+    "ParallelCamera",
+    "Rays",
+    "RenderedImage",
+    "ScalarField",
+    "render",
+]

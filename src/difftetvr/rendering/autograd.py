@@ -18,11 +18,14 @@ from difftetvr.rendering.kernels.forward import render_forward
 from difftetvr.rendering.tracers.linked_list import LinkedList
 from difftetvr.rendering.tracers.marching import Marching
 from difftetvr.rendering.tracers.projected import Projected
+from difftetvr.rendering.traversal.bundle import BundleRays
 from difftetvr.rendering.traversal.crossing import Tracer, View, vertex_records
+from difftetvr.rendering.traversal.rays import KernelRays
+from difftetvr.rendering.traversal.records import Records
 from difftetvr.rendering.traversal.transfer import Transfer
 
 Content = Literal["vertex", "cell", "scalar"]
-"""What a volume holds: (V, 3) colours and (V,) densities on vertices, (T, 3) and (T,) on cells, or (V,) scalars, (K,)
+"""What a volume holds: (V, C) channels and (V,) densities on vertices, (T, C) and (T,) on cells, or (V,) scalars, (K,)
 knots and (K, 4) densities and colours of their transfer function."""
 
 TRACERS: dict[str, Any] = {"marching": Marching, "linked-list": LinkedList, "projected": Projected}
@@ -31,42 +34,65 @@ TRACERS: dict[str, Any] = {"marching": Marching, "linked-list": LinkedList, "pro
 
 @dataclass(frozen=True)
 class RenderTask:
-    """What a view needs besides tensors that may require gradients."""
+    """What a view needs besides tensors that may require gradients.
+
+    Attributes:
+        backend: Where kernels run.
+        mesh: The mesh, for its topology.
+        camera: The camera whose rays are traced; None for a bundle of rays.
+        order: (N,) int32 number of the ray that each lane of a bundle has; None for rays as they are numbered.
+        optics: Optical model of one cell.
+        content: What the volume holds.
+        channels: Number of channels C that are seen.
+        threshold: Transmittance at or below which rays stop.
+        deterministic: Whether sums over rays have a fixed order.
+        renderer: How crossings are found.
+    """
 
     backend: Backend
     mesh: TetMesh
-    camera: Camera
+    camera: Camera | None
+    order: torch.Tensor | None
     optics: OpticalModel
     content: Content
+    channels: int
     threshold: float
     deterministic: bool
     renderer: str = "marching"
 
-    def tracer(self, vertices: torch.Tensor, limits: torch.Tensor | None, parts: Sequence[torch.Tensor]) -> Tracer:
+    def tracer(
+        self,
+        vertices: torch.Tensor,
+        limits: torch.Tensor | None,
+        lines: torch.Tensor | None,
+        parts: Sequence[torch.Tensor],
+    ) -> Tracer:
         """Upload a view.
 
         Args:
-            vertices: (V, 3) in camera space.
-            limits: (H, W, 2) distances between which each ray is looked at; None for all in front of the camera.
+            vertices: (V, 3) in camera space, or that of the rays.
+            limits: (N, 2) distances between which each ray is looked at; None for all in front of its origin.
+            lines: (N, 6) origins and unit directions of a bundle of rays; None for those of the camera.
             parts: What the volume holds, see :data:`Content`.
         """
         backend = self.backend
         cells = transfer = None
         if self.content == "vertex":
-            color, density = parts
-            records = vertex_records(backend, *(backend.floats(part) for part in (vertices, density, color)))
+            color, density = (backend.floats(part) for part in parts)
+            records = vertex_records(backend, backend.floats(vertices), density, color, self.channels)
         elif self.content == "cell":
             color, density = parts
             records = _with_fourth(backend, vertices, vertices.new_zeros(vertices.shape[0]))
-            cells = backend.floats(torch.cat([color, density[:, None]], dim=1))
+            cells = backend.floats(Records(self.channels).pack(color, density))
         else:
             scalar, knots, values = parts
             records = _with_fourth(backend, vertices, scalar)
             transfer = Transfer.of(backend, knots, values)
         view = View(
             backend,
-            self.camera,
+            self._rays(lines),
             self.optics,
+            self.channels,
             records,
             cells,
             transfer,
@@ -76,6 +102,12 @@ class RenderTask:
         tracer: Tracer = TRACERS[self.renderer].of(view, self.mesh, vertices)
         return tracer
 
+    def _rays(self, lines: torch.Tensor | None) -> KernelRays:
+        if lines is not None:
+            return BundleRays.of(self.backend, lines, self.order)
+        assert self.camera is not None
+        return self.camera.kernel_rays(self.backend)
+
 
 def _with_fourth(backend: Backend, vertices: torch.Tensor, values: torch.Tensor) -> Any:
     """Flat (V, 4) records of positions and one value each."""
@@ -83,19 +115,18 @@ def _with_fourth(backend: Backend, vertices: torch.Tensor, values: torch.Tensor)
 
 
 class RenderFunction(torch.autograd.Function):
-    """From vertices in camera space, limits and content to (H, W, 4) radiance and optical depth, (H, W) distance.
+    """From vertices, limits, rays and content to (N, width) records of channels and optical depth, (N,) distance.
 
     The inputs are those of :meth:`RenderTask.tracer`.
     """
 
     @staticmethod
-    def forward(ctx: Any, task: RenderTask, vertices: Any, limits: Any, *parts: Any) -> Any:
+    def forward(ctx: Any, task: RenderTask, vertices: Any, limits: Any, lines: Any, *parts: Any) -> Any:
         """Render; keeps only the image and, while gradients are wanted, the uploaded view."""
-        size = (task.camera.height, task.camera.width)
         with task.backend.exclusive():
-            tracer = task.tracer(vertices, limits, parts)
+            tracer = task.tracer(vertices, limits, lines, parts)
             light, distance = render_forward(tracer)
-            image = task.backend.tensor(light, *size, 4), task.backend.tensor(distance, *size)
+            image = task.backend.tensor(light, -1, tracer.view.records.width), task.backend.tensor(distance)
         ctx.set_materialize_grads(False)
         ctx.task, ctx.tracer = task, tracer
         ctx.vertex_count, ctx.part_size = vertices.shape[0], parts[0].shape[0]
@@ -108,7 +139,7 @@ class RenderFunction(torch.autograd.Function):
         """Go through the crossings again with the image's derivatives."""
         backend = ctx.task.backend
         light, distance = ctx.saved_tensors
-        needs_vertices, needs_limits = ctx.needs_input_grad[1:3]
+        wanted = Wanted(*ctx.needs_input_grad[1:4])
         with backend.exclusive(one_thread=ctx.task.deterministic):
             image = ImageAdjoint(
                 backend.floats(torch.zeros_like(light) if g_light is None else g_light),
@@ -116,21 +147,19 @@ class RenderFunction(torch.autograd.Function):
                 backend.floats(light),
                 backend.floats(distance),
             )
-            gradients = render_adjoint(ctx.tracer, image, ctx.vertex_count, Wanted(needs_vertices, needs_limits))
+            gradients = render_adjoint(ctx.tracer, image, ctx.vertex_count, wanted)
             vertices = (
-                backend.tensor(gradients.vertices).reshape(-1, 4)[: ctx.vertex_count, :3] if needs_vertices else None
+                backend.tensor(gradients.vertices).reshape(-1, 4)[: ctx.vertex_count, :3] if wanted.vertices else None
             )
-            limits = backend.tensor(gradients.limits, *distance.shape, 2) if needs_limits else None
+            limits = backend.tensor(gradients.limits, -1, 2) if wanted.limits else None
+            lines = backend.tensor(gradients.lines, -1, 6) if wanted.lines else None
+            field = backend.tensor(gradients.field)
             parts: tuple[torch.Tensor, ...]
             if gradients.transfer is None:
-                field = backend.tensor(gradients.field).reshape(-1, 4)[: ctx.part_size]
-                parts = field[:, :3], field[:, 3]
+                records = ctx.tracer.view.records
+                parts = records.unpack(field.reshape(-1, records.width)[: ctx.part_size])
             else:
                 values = backend.tensor(gradients.transfer.values).reshape(-1, 4)
-                parts = (
-                    backend.tensor(gradients.field)[: ctx.part_size],
-                    backend.tensor(gradients.transfer.knots),
-                    values,
-                )
-        wanted = (part if needed else None for part, needed in zip(parts, ctx.needs_input_grad[3:], strict=True))
-        return None, vertices, limits, *wanted
+                parts = field[: ctx.part_size], backend.tensor(gradients.transfer.knots), values
+        asked = (part if needed else None for part, needed in zip(parts, ctx.needs_input_grad[4:], strict=True))
+        return None, vertices, limits, lines, *asked

@@ -34,24 +34,55 @@ def clip_limits(
     Raises:
         DiffTetError: These are not four finite numbers, or the normal (a, b, c) is zero.
     """
+    coefficients, offset = _plane(plane, like, origin)
+    pose = camera.world_to_camera.to(like)
+    # No matrix products, which torch.autocast would round.
+    normal = (pose[:3, :3] * coefficients).sum(1)
+    at_camera = offset - (normal * pose[:3, 3]).sum()
+    directions = camera.ray_directions().to(like.dtype)  # before the device: not all of them know float64
+    near, far = _half_space((directions.to(like.device) * normal).sum(-1), at_camera)
+    return torch.stack((near.clamp(min=0.0), far), dim=-1)
+
+
+def clip_rays(
+    plane: Any, origins: torch.Tensor, directions: torch.Tensor, origin: Sequence[float] = (0.0, 0.0, 0.0)
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Distances between which lines lie in a half-space; differentiable in the plane and the rays.
+
+    Args:
+        plane: (4,) a, b, c, d of the half-space a x + b y + c z + d >= 0 in world space.
+        origins: (..., 3) points of the lines, relative to ``origin``.
+        directions: (..., 3) their unit directions.
+        origin: (3,) point of world space that the points count from.
+
+    Returns:
+        (...) first and last distance, which may be infinite; the last is smaller where a line is outside.
+
+    Raises:
+        DiffTetError: These are not four finite numbers, or the normal (a, b, c) is zero.
+    """
+    coefficients, offset = _plane(plane, origins, origin)
+    slope, at_origin = ((part * coefficients).sum(-1) for part in (directions, origins))
+    return _half_space(slope, at_origin + offset)
+
+
+def _plane(plane: Any, like: torch.Tensor, origin: Sequence[float]) -> tuple[torch.Tensor, torch.Tensor]:
+    """(3,) normal and offset of a plane of world space, seen from an origin there."""
     exact = as_reals(plane, "clip_plane", DiffTetError, torch.float64, "give a list or tensor a, b, c, d")
     coefficients = exact.to(like)
     values = coefficients.detach()
     if values.shape != (4,) or not bool(torch.isfinite(values).all()) or not bool(values[:3].any()):
         raise DiffTetError(f"clip_plane is {shown(plane)}; {_FINITE}.")
-    pose = camera.world_to_camera.to(like)
-    # No matrix products, which torch.autocast would round.
-    normal = (pose[:3, :3] * coefficients[:3]).sum(1)
     offset = coefficients[3]
     if any(origin):
         exact, shift = exact.cpu(), torch.tensor(list(origin), dtype=torch.float64)
         offset = (exact[3].double() + (exact[:3].double() * shift).sum()).to(like)
-    at_camera = offset - (normal * pose[:3, 3]).sum()
-    directions = camera.ray_directions().to(like.dtype)  # before the device: not all of them know float64
-    slope = (directions.to(like.device) * normal).sum(-1)
-    # Along a ray the plane's function is slope * t + at_camera.
-    crossing = -at_camera / torch.where(slope == 0, 1.0, slope)
-    nowhere = torch.where(at_camera < 0, -1.0, torch.inf)
-    near = torch.where(slope > 0, crossing.clamp(min=0), 0.0)
-    far = torch.where(slope < 0, crossing, torch.where(slope == 0, nowhere, torch.inf))
-    return torch.stack((near, far), dim=-1)
+    return coefficients[:3], offset
+
+
+def _half_space(slope: torch.Tensor, at_origin: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Distances between which the plane's function, slope * t + at_origin along a ray, is not negative."""
+    crossing = -at_origin / torch.where(slope == 0, 1.0, slope)
+    nowhere = torch.where(at_origin < 0, -torch.inf, torch.inf)
+    near = torch.where(slope > 0, crossing, -torch.inf)
+    return near, torch.where(slope < 0, crossing, torch.where(slope == 0, nowhere, torch.inf))

@@ -10,10 +10,11 @@ from difftetvr.backend import eager
 from difftetvr.errors import DiffTetError, MeshError, shown
 from difftetvr.inputs import as_reals, require_type
 from difftetvr.mesh import Field, TetMesh
-from difftetvr.rendering.api import as_background, compose, prepare_view
+from difftetvr.rendering.api import as_background, compose
 from difftetvr.rendering.cameras.pinhole import Camera
 from difftetvr.rendering.kernels.forward import render_forward
 from difftetvr.rendering.kernels.hats import RECORD, HatImage, hat_records
+from difftetvr.rendering.preparation import ViewOptions, prepare_view
 
 _TINY = 1e-30
 
@@ -176,7 +177,8 @@ def model_image(
         BackendError: No back end runs on the device of the mesh.
     """
     require_type(field, Field, "field", "pass a difftetvr.Field", DiffTetError)
-    view = prepare_view(mesh, field, camera, None, transmittance_threshold, deterministic)
+    options = ViewOptions(transmittance_threshold=transmittance_threshold, deterministic=deterministic)
+    view = prepare_view(mesh, field, camera, options)
     if view.task.content != "vertex":
         raise MeshError("The field lives on cells; hat functions need colours and densities on vertices.")
     truth = as_reals(truth, "The true image", DiffTetError)
@@ -189,11 +191,12 @@ def model_image(
     ):
         raise DiffTetError(f"valid is {shown(valid)}; pass a bool tensor of shape {tuple(truth.shape[:2])}.")
     behind = as_background(background, mesh.vertices)
-    backend, size = view.task.backend, (camera.height, camera.width)
+    backend = view.task.backend
     with backend.exclusive(one_thread=deterministic):
-        tracer = view.task.tracer(view.vertices, None, view.parts)
+        tracer = view.task.tracer(view.vertices, None, view.lines, view.parts)
         light, distance = render_forward(tracer)
-        image = compose(backend.tensor(light, *size, 4), backend.tensor(distance, *size), behind).color
+        gathered = backend.tensor(light, -1, tracer.view.records.width)
+        image = compose(view, gathered, backend.tensor(distance), behind, view.vertices.dtype).color
         residual = image - truth.to(image)
         if valid is not None:
             residual = residual * valid.to(residual.device)[..., None]

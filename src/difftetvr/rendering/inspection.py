@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -13,9 +14,10 @@ from difftetvr.backend import eager, require_own_threads
 from difftetvr.errors import DiffTetError
 from difftetvr.inputs import require_type
 from difftetvr.mesh import Field, TetMesh
-from difftetvr.rendering.api import prepare_view
 from difftetvr.rendering.cameras.pinhole import Camera
-from difftetvr.rendering.traversal.crossing import Rays, Span, Step, Tracer, corner_of, read_vertex
+from difftetvr.rendering.preparation import ViewOptions, prepare_view
+from difftetvr.rendering.traversal.crossing import Span, Step, Tracer, corner_of, read_vertex
+from difftetvr.rendering.traversal.rays import Lanes
 from difftetvr.rendering.traversal.walk import Corner, Face
 
 
@@ -58,17 +60,16 @@ def inspect_rays(
     require_type(mesh, TetMesh, "mesh", "pass a difftetvr.TetMesh", DiffTetError)
     require_own_threads()
     quality = mesh.quality()
-    # A field per cell makes the smallest vertex records; its first channel carries the quality.
-    color = torch.stack((quality, torch.zeros_like(quality), torch.zeros_like(quality)), dim=1)
-    view = prepare_view(mesh, Field(color, torch.zeros_like(quality), "cell"), camera, None, 0.0, False, renderer)
-    backend, size = view.task.backend, (camera.height, camera.width)
+    # A field per cell makes the smallest vertex records; its only channel carries the quality.
+    field = Field(quality[:, None], torch.zeros_like(quality), "cell")
+    view = prepare_view(mesh, field, camera, ViewOptions(renderer=renderer))
+    backend, rays = view.task.backend, math.prod(view.shape)
     limits = view.limits(clip_plane)
     with backend.exclusive():
-        tracer = view.task.tracer(view.vertices, limits, view.parts)
-        count = dr.zeros(backend.Int, camera.height * camera.width)
-        worst = dr.zeros(backend.Float, camera.height * camera.width)
+        tracer = view.task.tracer(view.vertices, limits, view.lines, view.parts)
+        count, worst = dr.zeros(backend.Int, rays), dr.zeros(backend.Float, rays)
         tracer.trace(lambda rays: _InspectionKernel(tracer, rays, count, worst))
-        counts, least = backend.tensor(count, *size), backend.tensor(worst, *size)
+        counts, least = backend.tensor(count, *view.shape), backend.tensor(worst, *view.shape)
     return RayStatistics(counts, torch.where(counts > 0, least, torch.nan))
 
 
@@ -81,7 +82,7 @@ class _Inspected:
 class _InspectionKernel:
     """Looks at cells; see :class:`difftetvr.rendering.traversal.crossing.Kernel`."""
 
-    def __init__(self, tracer: Tracer, rays: Rays, count: Any, worst: Any) -> None:
+    def __init__(self, tracer: Tracer, rays: Lanes, count: Any, worst: Any) -> None:
         self.view, self.rays, self.count, self.worst = tracer.view, rays, count, worst
         self.span = Span.of(tracer, rays)
 
@@ -94,7 +95,7 @@ class _InspectionKernel:
         return corner_of(self.rays.frame, vertex, position, attributes, 0)
 
     def visit(self, step: Step, ray: _Inspected) -> _Inspected:
-        quality = dr.gather(self.view.backend.Float4, self.view.cells, step.cell)[0]
+        quality = self.view.records.gather(self.view.backend, self.view.cells, step.cell)[0]
         # What lies behind the camera or is clipped is not met, whichever renderer comes across it.
         met = dr.mask_t(quality)(True)
         if self.span is not None:

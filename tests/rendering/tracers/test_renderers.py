@@ -17,9 +17,9 @@ from difftetvr.errors import DiffTetError, MeshError
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.rendering import Camera, OrderWarning, render
 from difftetvr.rendering.inspection import inspect_rays
+from difftetvr.rendering.search.scene import Scene as CellScene
 from difftetvr.rendering.tracers import linked_list, projected
 from difftetvr.rendering.tracers.bands import bands_of
-from difftetvr.rendering.tracers.entry_table import HalfFaceScene
 from difftetvr.rendering.tracers.tiles import Tiler
 
 RENDERERS = ("marching", "linked-list", "projected")
@@ -221,7 +221,7 @@ def test_faces_beside_the_camera_are_not_sought_in_the_whole_image() -> None:
     mesh = TetMesh.grid((8, 8, 8), (-1, -1, -1), (1, 1, 1))
     camera = Camera.look_at((0.05, 0.03, 0.01), (0.5, 1.0, 0.2), (0.0, 0.0, 1.0), 1.2, 64, 64)
     backend = backend_for(mesh.vertices)
-    scene = HalfFaceScene.of(backend, camera, mesh, camera.to_camera_space(mesh.vertices))
+    scene = CellScene.of(backend, camera.kernel_rays(backend), mesh, camera.to_camera_space(mesh.vertices))
     cells = mesh.vertices[mesh.tets.long()]
     depth = camera.to_camera_space(cells.reshape(-1, 3)).reshape(-1, 4, 3)[..., 2]
     crossing = (depth.amin(1) < 0) & (depth.amax(1) > 0)

@@ -82,7 +82,7 @@ def enter_box(
     """
     x = (b.Float(pixel[0]) + 0.5 - camera[14]) / camera[12]
     y = (b.Float(pixel[1]) + 0.5 - camera[15]) / camera[13]
-    norm = dr.rsqrt(dr.fma(x, x, dr.fma(y, y, 1.0)))
+    norm = 1.0 / dr.sqrt(dr.fma(x, x, dr.fma(y, y, 1.0)))  # rsqrt of float64 has 20 bits on CUDA
     near, far = b.Float(0.0), b.Float(dr.inf)
     origin, direction = [], []
     for axis in range(3):

@@ -1,6 +1,14 @@
+from . import detector as detector
+from . import lens as lens
+from . import panoramic as panoramic
+from . import parallel as parallel
 from . import pinhole as pinhole
 from . import pinhole_rays as pinhole_rays
 from . import rigid as rigid
+from .detector import Detector as Detector
+from .lens import LensCamera as LensCamera
+from .panoramic import PanoramicCamera as PanoramicCamera
+from .parallel import ParallelCamera as ParallelCamera
 from .pinhole import Camera as Camera
 
-__all__ = ["Camera"]
+__all__ = ["Camera", "Detector", "LensCamera", "PanoramicCamera", "ParallelCamera"]

@@ -15,7 +15,8 @@ from difftetvr.rendering.cameras.rigid import transformed
 
 if TYPE_CHECKING:
     from difftetvr.backend import Backend
-    from difftetvr.rendering.traversal.rays import CameraRays
+    from difftetvr.rendering.rays import Rays
+    from difftetvr.rendering.traversal.rays import ImageRays
 
 _ORTHONORMALITY_TOLERANCE = 1e-3
 _FAR = 16.0  # distances of camera and target from the origin, in their distance from each other
@@ -39,10 +40,12 @@ class Camera:
         cy: Principal point in pixels along y.
         width: Image width in pixels.
         height: Image height in pixels.
+        intrinsics: (4,) fx, fy, cx and cy as a tensor that images are differentiable in; None where none of them
+            requires a gradient. One that is passed replaces the four numbers; where one of these is a tensor that
+            requires a gradient, it is made of them.
 
     Raises:
-        CameraError: A value is out of range or no number, an intrinsic requires a gradient, or the extrinsics are no
-            rigid transform.
+        CameraError: A value is out of range or no number, or the extrinsics are no rigid transform.
     """
 
     world_to_camera: torch.Tensor
@@ -52,14 +55,16 @@ class Camera:
     cy: float
     width: int
     height: int
+    intrinsics: torch.Tensor | None = None
 
     def __post_init__(self) -> None:
+        self._gather_intrinsics()
         pose = as_reals(self.world_to_camera, "world_to_camera", CameraError)
         object.__setattr__(self, "world_to_camera", pose)
         if pose.shape != (4, 4):
             raise CameraError(f"world_to_camera has shape {tuple(pose.shape)}; give a (4, 4) matrix.")
         for name in ("fx", "fy", "cx", "cy"):
-            object.__setattr__(self, name, _number(name, getattr(self, name)))
+            object.__setattr__(self, name, number(name, getattr(self, name)))
         for name in ("width", "height"):
             object.__setattr__(self, name, _size(name, getattr(self, name)))
         if not all(math.isfinite(v) for v in (self.fx, self.fy, self.cx, self.cy)):
@@ -81,6 +86,21 @@ class Camera:
                 "world_to_camera is no rigid transform (rotation without scale or mirror, last row 0 0 0 1); "
                 "orthonormalise it first."
             )
+
+    def _gather_intrinsics(self) -> None:
+        names = ("fx", "fy", "cx", "cy")
+        given, values = self.intrinsics, [getattr(self, name) for name in names]
+        if given is None and any(isinstance(value, torch.Tensor) and value.requires_grad for value in values):
+            numbers = (as_reals(v, f"The camera's {n}", CameraError) for n, v in zip(names, values, strict=True))
+            given = torch.cat([v.reshape(-1).double() for v in numbers])
+        if given is None:
+            return
+        given = as_reals(given, "The camera's intrinsics", CameraError)
+        if given.shape != (4,):
+            raise CameraError(f"The camera's intrinsics have shape {tuple(given.shape)}; pass fx, fy, cx and cy, (4,).")
+        for name, value in zip(names, given.tolist(), strict=True):
+            object.__setattr__(self, name, value)
+        object.__setattr__(self, "intrinsics", given if given.requires_grad else None)
 
     @staticmethod
     def look_at(
@@ -108,7 +128,7 @@ class Camera:
         Raises:
             CameraError: The points coincide, ``up`` is parallel to the view, or a value is out of range.
         """
-        fov_y, width, height = _number("fov_y", fov_y), _size("width", width), _size("height", height)
+        fov_y, width, height = number("fov_y", fov_y), _size("width", width), _size("height", height)
         if not 0.0 < fov_y < math.pi:
             raise CameraError(f"fov_y is {fov_y} radians; it must lie between 0 and pi.")
         vectors = {"eye": eye, "target": target, "up": up}
@@ -158,14 +178,31 @@ class Camera:
         return transformed(points, pose[:3, :3], pose[:3, 3])
 
     def ray_directions(self) -> torch.Tensor:
-        """(H, W, 3) unit directions of the pixels' rays in camera space, float64."""
-        x = (torch.arange(self.width, dtype=torch.float64) + 0.5 - self.cx) / self.fx
-        y = (torch.arange(self.height, dtype=torch.float64) + 0.5 - self.cy) / self.fy
-        rows, columns = torch.meshgrid(y, x, indexing="ij")
-        directions = torch.stack([columns, rows, torch.ones_like(rows)], dim=-1)
+        """(H, W, 3) unit directions of the pixels' rays in camera space, float64; differentiable in the intrinsics."""
+        points = self.plane_points()
+        directions = torch.cat([points, torch.ones_like(points[..., :1])], dim=-1)
         return directions / directions.norm(dim=-1, keepdim=True)
 
-    def kernel_rays(self, backend: Backend) -> CameraRays:
+    def plane_points(self) -> torch.Tensor:
+        """(H, W, 2) where the pixels' centres lie in the plane at distance 1, float64; differentiable likewise."""
+        fx, fy, cx, cy = (
+            (self.fx, self.fy, self.cx, self.cy) if self.intrinsics is None else self.intrinsics.double().cpu().unbind()
+        )
+        x = (torch.arange(self.width, dtype=torch.float64) + 0.5 - cx) / fx
+        y = (torch.arange(self.height, dtype=torch.float64) + 0.5 - cy) / fy
+        rows, columns = torch.meshgrid(y, x, indexing="ij")
+        return torch.stack([columns, rows], dim=-1)
+
+    def rays(self) -> Rays:
+        """The rays of all pixels in world space, (H, W); differentiable in extrinsics and intrinsics."""
+        from difftetvr.rendering.rays import Rays  # late: it needs cameras' errors, not cameras
+
+        pose = self.world_to_camera.double()
+        directions = (self.ray_directions().to(pose.device)[..., None] * pose[:3, :3]).sum(-2)
+        origin = -(pose[:3, :3] * pose[:3, 3:]).sum(0)
+        return Rays(origin.expand(directions.shape), directions)
+
+    def kernel_rays(self, backend: Backend) -> ImageRays:
         """The camera's rays for kernels of a back end."""
         from difftetvr.rendering.cameras.pinhole_rays import PinholeRays  # late: cameras are there without kernels
 
@@ -175,9 +212,9 @@ class Camera:
         """The same view at another resolution."""
         width, height = _size("width", width), _size("height", height)
         sx, sy = width / self.width, height / self.height
-        return replace(
-            self, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy, width=width, height=height
-        )
+        own = None if self.intrinsics is None else self.intrinsics * self.intrinsics.new_tensor([sx, sy, sx, sy])
+        fx, fy, cx, cy = self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy
+        return replace(self, fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height, intrinsics=own)
 
     def relative_to(self, origin: Sequence[float]) -> Camera:
         """The same view of a world whose origin lies at a point of this one; differentiable in the extrinsics.
@@ -197,12 +234,12 @@ class Camera:
         return replace(self, world_to_camera=world_to_camera)
 
 
-def _number(name: str, value: object) -> float:
-    if isinstance(value, torch.Tensor) and value.requires_grad:
-        raise CameraError(
-            f"The camera's {name} requires a gradient, but images have none by intrinsics, only by the pose; pass "
-            f"float({name}.detach())."
-        )
+def number(name: str, value: object) -> float:
+    """A camera's parameter as a number.
+
+    Raises:
+        CameraError: It is none.
+    """
     return as_number(value, f"The camera's {name}", CameraError)
 
 

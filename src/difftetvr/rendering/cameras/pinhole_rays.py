@@ -9,7 +9,14 @@ import drjit as dr
 import torch
 
 from difftetvr.backend import Backend
-from difftetvr.rendering.traversal.rays import Frame, largest_coordinate, rounding_of
+from difftetvr.rendering.traversal.rays import (
+    Frame,
+    Lanes,
+    lane_count,
+    lane_pixel,
+    largest_coordinate,
+    rounding_of,
+)
 
 if TYPE_CHECKING:
     from difftetvr.rendering.cameras.pinhole import Camera
@@ -21,8 +28,9 @@ _NEAR_PLANE = 2.0**-8  # points nearer to the camera's plane, in units of their 
 
 @dataclass
 class PinholeRays:
-    """Intrinsics and image size as device values, so that a new view needs no recompilation; see `CameraRays`."""
+    """Intrinsics and image size as device values, so that a new view needs no recompilation; see `ImageRays`."""
 
+    size: tuple[int, int]
     inverse_fx: Any
     inverse_fy: Any
     fx: Any
@@ -39,9 +47,30 @@ class PinholeRays:
         floats = backend.floats(torch.tensor(values, dtype=backend.dtype, device=backend.device))
         sizes = backend.uints(torch.tensor([camera.width, camera.height], dtype=torch.int32, device=backend.device))
         return PinholeRays(
+            (camera.width, camera.height),
             *(dr.gather(backend.Float, floats, backend.UInt(i)) for i in range(6)),
             *(dr.gather(backend.UInt, sizes, backend.UInt(i)) for i in range(2)),
         )
+
+    @property
+    def count(self) -> int:
+        """Number of pixels."""
+        return self.size[0] * self.size[1]
+
+    @property
+    def lane_count(self) -> int:
+        """Number of lanes: the size rounded up to whole blocks."""
+        return lane_count(*self.size)
+
+    def of_lanes(self, lane: Any) -> Lanes:
+        """Neighbouring lanes see neighbouring pixels, so rays share cells in cache."""
+        column, row, valid = lane_pixel(self, lane)
+        return Lanes(row * self.width + column, valid, self.frame(column, row))
+
+    def of_pixels(self, pixel: Any) -> Frame:
+        """Frames of the rays of some pixels."""
+        row = pixel // self.width
+        return self.frame(pixel - row * self.width, row)
 
     def frame(self, column: Any, row: Any) -> Frame:
         """Frame of the ray through the centre of a pixel (Duff et al. 2017, branch-free because z > 0)."""

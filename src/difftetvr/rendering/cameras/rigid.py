@@ -30,17 +30,26 @@ class _Transform(torch.autograd.Function):
     def forward(ctx: Any, points: torch.Tensor, rotation: torch.Tensor, offset: torch.Tensor) -> torch.Tensor:
         ctx.save_for_backward(points, rotation)
         with full_precision(points):
-            return torch.addmm(offset, points, rotation.T)
+            return offset + _rows_times(points, rotation.T)
 
     @staticmethod
     def backward(ctx: Any, gradient: torch.Tensor) -> Any:
         points, rotation = ctx.saved_tensors
         with full_precision(points):
             return (
-                gradient @ rotation if ctx.needs_input_grad[0] else None,
-                gradient.T @ points if ctx.needs_input_grad[1] else None,
+                _rows_times(gradient, rotation) if ctx.needs_input_grad[0] else None,
+                torch.stack([(gradient * column[:, None]).sum(0) for column in points.unbind(1)], dim=1)
+                if ctx.needs_input_grad[1]
+                else None,
                 gradient.sum(0) if ctx.needs_input_grad[2] else None,
             )
+
+
+def _rows_times(rows: torch.Tensor, matrix: torch.Tensor) -> torch.Tensor:
+    """``rows @ matrix`` for (N, 3) and (3, 3), without a matrix product, which GPUs may round to TF32."""
+    x, y, z = (column[:, None] for column in rows.unbind(1))
+    a, b, c = matrix.unbind(0)
+    return torch.addcmul(torch.addcmul(x * a, y, b), z, c)
 
 
 def full_precision(like: torch.Tensor) -> AbstractContextManager[Any]:

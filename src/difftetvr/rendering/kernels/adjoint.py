@@ -2,8 +2,11 @@
 
 It runs through the same crossings again, front to back. ``rest`` is the part of <dL/dimage, image> still ahead of the
 ray, so the derivative with respect to a cell's optical depth needs nothing from behind it (the inversion trick of Weiss
-and Westermann without its division). Colour enters only as <dL/dcolour, colour>: two numbers a vertex are carried. Each
-step of a walk drops exactly one vertex, so exactly one record is scattered.
+and Westermann without its division). Channels enter only as <dL/dchannels, channels>: two numbers a vertex are carried.
+Each step of a walk drops exactly one vertex, so exactly one record is scattered.
+
+Derivatives by the rays themselves come along: moving a ray is moving all it meets the other way, and turning it moves
+what lies at distance t by t.
 """
 
 from __future__ import annotations
@@ -15,15 +18,16 @@ import drjit as dr
 
 from difftetvr.rendering.traversal.crossing import (
     Clip,
-    Rays,
     Span,
     Step,
     Tracer,
     View,
     corner_of,
     inverse_length,
+    read_channels,
     read_vertex,
 )
+from difftetvr.rendering.traversal.rays import Lanes
 from difftetvr.rendering.traversal.transfer import CrossingAdjoint, Piece, PieceAdjoint, TransferGradients
 from difftetvr.rendering.traversal.walk import Corner, Face
 
@@ -35,10 +39,10 @@ class ImageAdjoint:
     """Flat derivatives of the loss with respect to the kernel's outputs, and those outputs.
 
     Attributes:
-        light: (H, W, 4) derivatives with respect to radiance and optical depth.
-        distance: (H, W) derivatives with respect to the integral of distance; None if they are all zero.
-        out_light: (H, W, 4) radiance and optical depth.
-        out_distance: (H, W) integral of distance.
+        light: (N, width) records, derivatives with respect to channels and optical depth.
+        distance: (N,) derivatives with respect to the integral of distance; None if they are all zero.
+        out_light: (N, width) records of channels and optical depth.
+        out_distance: (N,) integral of distance.
     """
 
     light: Any
@@ -52,9 +56,10 @@ class Gradients:
     """Flat gradient buffers.
 
     Attributes:
-        field: (N, 4): red, green, blue, density of at least V vertices or T cells; or (N,) scalars of vertices.
-        vertices: (N, 4): x, y, z in camera space and padding; None if positions need no gradient.
-        limits: (H, W, 2): the distances between which rays are looked at; None if they need no gradient.
+        field: (M, width) records: channels and density of at least V vertices or T cells; or (M,) scalars of vertices.
+        vertices: (M, 4): x, y, z in the space of the vertices and padding; None if positions need no gradient.
+        limits: (N, 2): the distances between which rays are looked at; None if they need no gradient.
+        lines: (N, 6): the rays' origins and directions; None if they need no gradient.
         transfer: The transfer function; None if there is none.
         mode: How additions of several rays to one record are reduced.
     """
@@ -62,6 +67,7 @@ class Gradients:
     field: Any
     vertices: Any | None
     limits: Any | None
+    lines: Any | None
     transfer: TransferGradients | None
     mode: dr.ReduceMode
 
@@ -75,12 +81,15 @@ class AdjointRay:
         rest: Part of <dL/dimage, image> that lies behind it.
         carry: Derivatives with respect to distance, density and radiance at the crossing, from the cell in front.
         limits: Derivatives with respect to the ends of the span that is looked at; empty where none are wanted.
+        line: Derivatives with respect to the ray, in its frame: by moving it along a, b and t, and by turning it
+            towards a and b; empty where none are wanted.
     """
 
     transmittance: Any
     rest: Any
     carry: list[Any]
     limits: list[Any]
+    line: list[Any]
 
 
 @dataclass
@@ -112,10 +121,11 @@ class Wanted:
 
     vertices: bool
     limits: bool
+    lines: bool = False
 
 
 def render_adjoint(tracer: Tracer, image: ImageAdjoint, vertex_count: int, wanted: Wanted) -> Gradients:
-    """Gradients of a view with respect to the field and, if asked, the vertices in camera space and the rays' limits.
+    """Gradients of a view with respect to the field and, if asked, the vertices, the rays and their limits.
 
     Args:
         tracer: The tracer that ``render_forward`` saw.
@@ -125,7 +135,8 @@ def render_adjoint(tracer: Tracer, image: ImageAdjoint, vertex_count: int, wante
     """
     view = tracer.view
     real = view.backend.Float
-    field_count = buffer_length(vertex_count if view.cells is None else dr.width(view.cells) // 4)
+    width = 1 if view.transfer is not None else view.records.width
+    field_count = buffer_length(vertex_count if view.cells is None else dr.width(view.cells) // width)
     position_count = buffer_length(vertex_count) if wanted.vertices else 0
     transfer = None
     if view.transfer is not None:
@@ -133,51 +144,57 @@ def render_adjoint(tracer: Tracer, image: ImageAdjoint, vertex_count: int, wante
             *(dr.zeros(real, dr.width(a)) for a in (view.transfer.knots, view.transfer.values))
         )
     gradients = Gradients(
-        dr.zeros(real, field_count if transfer else 4 * field_count),
+        dr.zeros(real, width * field_count),
         dr.zeros(real, 4 * position_count) if wanted.vertices else None,
         dr.zeros(real, dr.width(view.limits)) if wanted.limits else None,
+        dr.zeros(real, 6 * view.rays.count) if wanted.lines else None,
         transfer,
-        reduce_mode(view, 4 * (field_count + position_count)),
+        reduce_mode(view, width * field_count + 4 * position_count),
     )
     tracer.trace(lambda rays: _AdjointKernel(tracer, rays, image, gradients))
-    view.backend.run(gradients.field, gradients.vertices, gradients.limits, gradients.transfer)
+    view.backend.run(gradients.field, gradients.vertices, gradients.limits, gradients.lines, gradients.transfer)
     return gradients
 
 
 class _AdjointKernel:
     """Gathers derivatives; see :class:`difftetvr.rendering.traversal.crossing.Kernel`."""
 
-    def __init__(self, tracer: Tracer, rays: Rays, image: ImageAdjoint, gradients: Gradients) -> None:
+    def __init__(self, tracer: Tracer, rays: Lanes, image: ImageAdjoint, gradients: Gradients) -> None:
         self.view, self.gradients, self.rays = tracer.view, gradients, rays
         self.span = Span.of(tracer, rays)
         backend, pixel, valid = self.view.backend, rays.pixel, rays.valid
-        light = dr.gather(backend.Float4, image.light, pixel, valid)
-        seen = dr.gather(backend.Float4, image.out_light, pixel, valid)
-        self.rest = sum((light[k] * seen[k] for k in range(1, 3)), light[0] * seen[0])
-        self.pixel = PixelAdjoint([light[0], light[1], light[2]], light[3], None)
+        *light, optical_depth = self.view.records.gather(backend, image.light, pixel, valid)
+        *seen, _ = self.view.records.gather(backend, image.out_light, pixel, valid)
+        self.rest = sum((g * c for g, c in zip(light, seen, strict=True)), dr.zeros(backend.Float, dr.width(pixel)))
+        self.pixel = PixelAdjoint(light, optical_depth, None)
         if image.distance is not None:
             self.pixel.distance = dr.gather(backend.Float, image.distance, pixel, valid)
             far = dr.gather(backend.Float, image.out_distance, pixel, valid)
             self.rest = dr.fma(self.pixel.distance, far, self.rest)
         # Accumulators of a vertex: its scalar, or density and radiance, then its position in the ray's frame; for
         # fields on cells only the position.
-        self.field_slots = 0 if self.view.cells is not None else 1 if self.view.transfer is not None else 2
+        self.field_slots = 0 if self.view.cells is not None else 2 if self.view.has_vertex_channels else 1
         self.slots = self.field_slots + (3 if gradients.vertices is not None else 0)
 
     def start(self) -> AdjointRay:
         real, lanes = self.view.backend.Float, dr.width(self.rays.pixel)
-        limits = [dr.zeros(real, lanes) for _ in range(2 if self.gradients.limits is not None else 0)]
-        return AdjointRay(dr.ones(real, lanes), self.rest, [dr.zeros(real, lanes) for _ in range(3)], limits)
+        limits = 2 if self.gradients.limits is not None else 0
+        line = 5 if self.gradients.lines is not None else 0
+        zeros = ([dr.zeros(real, lanes) for _ in range(count)] for count in (3, limits, line))
+        return AdjointRay(dr.ones(real, lanes), self.rest, *zeros)
 
     def read(self, vertex: Any, active: Any) -> Corner:
         position, attributes = read_vertex(self.view, vertex, active)
-        if len(attributes) > 1:
-            attributes = [attributes[0], self._radiance(attributes[1:])]
+        if self.view.has_vertex_channels:
+            attributes = [*attributes, self._radiance(read_channels(self.view, vertex, active))]
         return corner_of(self.rays.frame, vertex, position, attributes, self.slots)
 
-    def _radiance(self, color: list[Any]) -> Any:
-        g = self.pixel.color
-        return dr.fma(g[0], color[0], dr.fma(g[1], color[1], g[2] * color[2]))
+    def _radiance(self, channels: list[Any]) -> Any:
+        """What channels are worth to the loss."""
+        total = None
+        for g, c in zip(reversed(self.pixel.color), reversed(channels), strict=True):
+            total = g * c if total is None else dr.fma(g, c, total)
+        return self.view.backend.Float(0) if total is None else total
 
     def visit(self, step: Step, ray: AdjointRay) -> AdjointRay:
         start, end = step.entry, step.leaving
@@ -188,9 +205,11 @@ class _AdjointKernel:
         if clip:
             start, end = clip.start(start, end), clip.end(start, end)
         if self.view.cells is not None:
-            record = dr.gather(self.view.backend.Float4, self.view.cells, step.cell)
-            constant = [record[3], self._radiance([record[0], record[1], record[2]])]
+            *channels, density = self.view.records.gather(self.view.backend, self.view.cells, step.cell)
+            constant = [density, self._radiance(channels)]
             start, end = [start[0], *constant], [end[0], *constant]
+        elif self.view.channels == 0:
+            start, end = ([*values, self._radiance([])] for values in (start, end))
         ray, at_start, at_end = (
             self._cross(start, end, ray, end[0] > start[0])
             if self.view.transfer is None
@@ -198,11 +217,11 @@ class _AdjointKernel:
         )
         if self.view.cells is not None:
             self._scatter_field(step.cell, at_start[1] + at_end[1], at_start[2] + at_end[2], True)
-            at_start, at_end = at_start[:1], at_end[:1]
+        at_start, at_end = at_start[: 1 + self.field_slots], at_end[: 1 + self.field_slots]
         if clip:
             at_start, at_end, at_limits = _unclip(clip, step, at_start, at_end)
             ray.limits = [old + new for old, new in zip(ray.limits, at_limits, strict=False)]
-        self._distribute(step.face, [c + g for c, g in zip(ray.carry, at_start, strict=False)])
+        line = self._distribute(step.face, [c + g for c, g in zip(ray.carry, at_start, strict=False)], ray.line)
         self._scatter(
             step.exit.vertex(step.face),
             [step.exit.pick([corner.adjoints[i] for corner in step.face.corners]) for i in range(self.slots)],
@@ -210,7 +229,7 @@ class _AdjointKernel:
         )
         step.exit.carry_adjoints(step.face, step.next_face)
         unused = [dr.zeros_like(ray.rest) for _ in range(3 - len(at_end))]
-        return AdjointRay(ray.transmittance, ray.rest, at_end + unused, ray.limits)
+        return AdjointRay(ray.transmittance, ray.rest, at_end + unused, ray.limits, line)
 
     def _cross(
         self, start: list[Any], end: list[Any], ray: AdjointRay, is_crossed: Any
@@ -238,7 +257,7 @@ class _AdjointKernel:
         if far is not None:
             d_t0, d_t1 = dr.fma(far, w0, d_t0), dr.fma(far, w1, d_t1)
         at_start, at_end = [d_t0, d_s0, w0], [d_t1, d_s1, w1]
-        return AdjointRay(transmittance, rest, ray.carry, ray.limits), at_start, at_end
+        return AdjointRay(transmittance, rest, ray.carry, ray.limits, ray.line), at_start, at_end
 
     def _cut(self, start: list[Any], end: list[Any], ray: AdjointRay) -> tuple[AdjointRay, list[Any], list[Any]]:
         """Adjoint of one cell, piece by piece: derivatives with respect to (distance, scalar) at its start and end."""
@@ -265,30 +284,43 @@ class _AdjointKernel:
 
     def leave(self, face: Face, ray: AdjointRay, active: Any) -> AdjointRay:
         carry = ray.carry[: 1 + self.field_slots]
-        self._distribute(face, carry)
+        line = self._distribute(face, carry, ray.line)
         for corner in face.corners:
             self._scatter(corner.vertex, corner.adjoints, active)
-        return AdjointRay(ray.transmittance, ray.rest, [dr.zeros_like(c) for c in ray.carry], ray.limits)
+        line = [dr.select(active, new, old) for new, old in zip(line, ray.line, strict=True)]
+        return AdjointRay(ray.transmittance, ray.rest, [dr.zeros_like(c) for c in ray.carry], ray.limits, line)
 
     def finish(self, ray: AdjointRay) -> None:
         if self.gradients.limits is not None:
             packet = self.view.backend.Float2(*ray.limits)
             dr.scatter(self.gradients.limits, packet, self.rays.pixel, self.rays.valid)
+        if self.gradients.lines is not None:
+            moved, turned = self.rays.frame.unproject(*ray.line[:3]), (*ray.line[3:], ray.line[0] * 0.0)
+            values = [*moved, *self.rays.frame.unproject(*turned)]
+            for k in range(3):
+                packet = self.view.backend.Float2(*values[2 * k : 2 * k + 2])
+                dr.scatter(self.gradients.lines, packet, 3 * self.rays.pixel + k, self.rays.valid)
 
-    def _distribute(self, face: Face, crossing: list[Any]) -> None:
-        """Add a crossing's derivatives to the accumulators of its face's corners."""
+    def _distribute(self, face: Face, crossing: list[Any], line: list[Any]) -> list[Any]:
+        """Add a crossing's derivatives to the accumulators of its face's corners; returns those of the ray."""
         weights = face.weights()
         for corner, weight in zip(face.corners, weights, strict=True):
             for slot in range(self.field_slots):
                 corner.adjoints[slot] = dr.fma(weight, crossing[1 + slot], corner.adjoints[slot])
-        if self.gradients.vertices is None:
-            return
+        if self.gradients.vertices is None and not line:
+            return line
         slope_a, slope_b = _slope(face, crossing)
-        for corner, weight in zip(face.corners, weights, strict=True):
-            first = self.field_slots
-            corner.adjoints[first] = dr.fma(-weight, slope_a, corner.adjoints[first])
-            corner.adjoints[first + 1] = dr.fma(-weight, slope_b, corner.adjoints[first + 1])
-            corner.adjoints[first + 2] = dr.fma(weight, crossing[0], corner.adjoints[first + 2])
+        if self.gradients.vertices is not None:
+            for corner, weight in zip(face.corners, weights, strict=True):
+                first = self.field_slots
+                corner.adjoints[first] = dr.fma(-weight, slope_a, corner.adjoints[first])
+                corner.adjoints[first + 1] = dr.fma(-weight, slope_b, corner.adjoints[first + 1])
+                corner.adjoints[first + 2] = dr.fma(weight, crossing[0], corner.adjoints[first + 2])
+        if not line:
+            return line
+        distance = sum((w * c.values[0] for w, c in zip(weights, face.corners, strict=True)), slope_a * 0.0)
+        moved = [line[0] + slope_a, line[1] + slope_b, line[2] - crossing[0]]
+        return [*moved, dr.fma(distance, slope_a, line[3]), dr.fma(distance, slope_b, line[4])]
 
     def _scatter(self, vertex: Any, adjoints: list[Any], active: Any) -> None:
         if self.field_slots == 1:
@@ -296,15 +328,15 @@ class _AdjointKernel:
         elif self.field_slots:
             self._scatter_field(vertex, adjoints[0], adjoints[1], active)
         if self.gradients.vertices is not None:
-            position = self.rays.frame.to_camera_space(*adjoints[self.field_slots :])
-            self._scatter_record(self.gradients.vertices, vertex, [*position, type(position[0])(0)], active)
+            position = self.rays.frame.unproject(*adjoints[self.field_slots :])
+            record = self.view.backend.Float4(*position, 0.0)
+            dr.scatter_add(self.gradients.vertices, record, vertex, active, mode=self.gradients.mode)
 
     def _scatter_field(self, index: Any, density: Any, radiance: Any, active: Any) -> None:
         record = [radiance * g for g in self.pixel.color] + [density]
-        self._scatter_record(self.gradients.field, index, record, active)
-
-    def _scatter_record(self, buffer: Any, index: Any, record: list[Any], active: Any) -> None:
-        dr.scatter_add(buffer, self.view.backend.Float4(*record), index, active, mode=self.gradients.mode)
+        self.view.records.scatter_add(
+            self.view.backend, self.gradients.field, record, index, active, self.gradients.mode
+        )
 
 
 def _unclip(clip: Clip, step: Step, at_start: list[Any], at_end: list[Any]) -> tuple[list[Any], list[Any], list[Any]]:

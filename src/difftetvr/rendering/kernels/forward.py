@@ -1,4 +1,8 @@
-"""From crossings to an image: emission and absorption along rays (Dr.Jit kernel)."""
+"""From crossings to an image: emission and absorption along rays (Dr.Jit kernel).
+
+Channels of vertices are not interpolated: a ray carries, for the three vertices of the face it passes, the weights by
+which it sees them, and adds a vertex's channels when it drops it. So their number costs next to nothing in the walk.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +11,15 @@ from typing import Any
 
 import drjit as dr
 
-from difftetvr.rendering.traversal.crossing import Rays, Span, Step, Tracer, corner_of, read_vertex
+from difftetvr.rendering.traversal.crossing import (
+    Span,
+    Step,
+    Tracer,
+    corner_of,
+    read_channels,
+    read_vertex,
+)
+from difftetvr.rendering.traversal.rays import Lanes
 from difftetvr.rendering.traversal.walk import Corner, Face
 
 
@@ -16,27 +28,29 @@ class Radiance:
     """What a ray has gathered.
 
     Attributes:
-        color: Premultiplied radiance, three components.
+        channels: Premultiplied radiance, or whatever the channels are.
         distance: Integral of the distance at which light is absorbed.
         optical_depth: Optical depth; beside the transmittance, since 1 - exp(-x) of a thin medium needs it.
         transmittance: Its exponential, the part of light still to come.
+        carry: The weight of the face passed last, not yet given to its corners; only where vertices have channels.
     """
 
-    color: list[Any]
+    channels: list[Any]
     distance: Any
     optical_depth: Any
     transmittance: Any
+    carry: list[Any]
 
 
 def render_forward(tracer: Tracer) -> tuple[Any, Any]:
     """Render a view.
 
     Returns:
-        Flat arrays: (H, W, 4) premultiplied radiance and optical depth, (H, W) integral of the distance.
+        Flat arrays: (N, width) records of premultiplied radiance and optical depth, (N,) integral of the distance.
     """
     view = tracer.view
-    real, pixels = view.backend.Float, view.camera.width * view.camera.height
-    light, distance = dr.empty(real, 4 * pixels), dr.empty(real, pixels)
+    real, count = view.backend.Float, view.rays.count
+    light, distance = dr.empty(real, view.records.width * count), dr.empty(real, count)
     tracer.trace(lambda rays: _ForwardKernel(tracer, rays, light, distance))
     view.backend.run(light, distance)
     return light, distance
@@ -45,54 +59,91 @@ def render_forward(tracer: Tracer) -> tuple[Any, Any]:
 class _ForwardKernel:
     """Gathers light; see :class:`difftetvr.rendering.traversal.crossing.Kernel`."""
 
-    def __init__(self, tracer: Tracer, rays: Rays, light: Any, distance: Any) -> None:
+    def __init__(self, tracer: Tracer, rays: Lanes, light: Any, distance: Any) -> None:
         self.view, self.rays, self.light, self.distance = tracer.view, rays, light, distance
         self.span = Span.of(tracer, rays)
+        self.slots = 1 if self.view.has_vertex_channels else 0
 
     def start(self) -> Radiance:
         real, lanes = self.view.backend.Float, dr.width(self.rays.pixel)
-        zeros = [dr.zeros(real, lanes) for _ in range(5)]
-        return Radiance(zeros[:3], zeros[3], zeros[4], dr.ones(real, lanes))
+        channels, (distance, optical_depth), carry = (
+            [dr.zeros(real, lanes) for _ in range(count)] for count in (self.view.channels, 2, self.slots)
+        )
+        return Radiance(channels, distance, optical_depth, dr.ones(real, lanes), carry)
 
     def read(self, vertex: Any, active: Any) -> Corner:
         position, attributes = read_vertex(self.view, vertex, active)
-        return corner_of(self.rays.frame, vertex, position, attributes, 0)
+        return corner_of(self.rays.frame, vertex, position, attributes, self.slots)
 
     def visit(self, step: Step, ray: Radiance) -> Radiance:
-        entry, leaving = step.entry, step.leaving
-        if self.view.transfer is not None:
-            entry = self.view.transfer.bounded(entry, step.face)
-            leaving = self.view.transfer.bounded(leaving, step.next_face)
+        view, entry, leaving, clip = self.view, step.entry, step.leaving, None
+        if view.transfer is not None:
+            entry = view.transfer.bounded(entry, step.face)
+            leaving = view.transfer.bounded(leaving, step.next_face)
         if self.span is not None:
             clip = self.span.clip(entry[0], leaving[0])
             entry, leaving = clip.start(entry, leaving), clip.end(entry, leaving)
-        if self.view.cells is not None:
-            record = dr.gather(self.view.backend.Float4, self.view.cells, step.cell)
-            entry, leaving = ([values[0], record[3], record[0], record[1], record[2]] for values in (entry, leaving))
-        if self.view.transfer is not None:
-            pass_piece = lambda piece, ray: self._gather(piece.start_values, piece.end_values, ray)  # noqa: E731
-            return self.view.transfer.cut(entry, leaving, pass_piece, ray)
-        return self._gather(entry, leaving, ray)
+        if view.transfer is not None:
+            return view.transfer.cut(
+                entry, leaving, lambda piece, ray: self._gather(piece.start_values, piece.end_values, ray), ray
+            )
+        if view.cells is not None:
+            *channels, density = view.records.gather(view.backend, view.cells, step.cell)
+            return self._gather([entry[0], density, *channels], [leaving[0], density, *channels], ray)
+        ray, w0, w1 = self._pass(entry, leaving, ray)
+        if not self.slots:
+            return ray
+        if clip is not None:
+            w0, w1 = clip.unclipped(w0, w1)
+        _distribute(step.face, w0 + ray.carry[0])
+        seen = step.exit.pick([corner.adjoints[0] for corner in step.face.corners])
+        channels = self._add(ray.channels, seen, step.exit.vertex(step.face), True)
+        step.exit.carry_adjoints(step.face, step.next_face)
+        return Radiance(channels, ray.distance, ray.optical_depth, ray.transmittance, [w1])
 
-    def _gather(self, entry: list[Any], leaving: list[Any], ray: Radiance) -> Radiance:
-        """Pass a segment with linear density and colour: distance, density and linear RGB at both ends."""
+    def _pass(self, entry: list[Any], leaving: list[Any], ray: Radiance) -> tuple[Radiance, Any, Any]:
+        """Pass a segment of linear density, given distance and density at both ends; also the weights of its ends."""
         length = dr.fmax(leaving[0] - entry[0], 0.0)
         w0, w1, transmittance = self.view.optics.weights(length, entry[1], leaving[1])
         w0, w1 = w0 * ray.transmittance, w1 * ray.transmittance
-        color = [dr.fma(w0, c0, dr.fma(w1, c1, c)) for c0, c1, c in zip(entry[2:], leaving[2:], ray.color, strict=True)]
         distance = dr.fma(w0, entry[0], dr.fma(w1, leaving[0], ray.distance))
         half = 0.5 * length
         optical_depth = dr.fma(half, entry[1], dr.fma(half, leaving[1], ray.optical_depth))
-        return Radiance(color, distance, optical_depth, ray.transmittance * transmittance)
+        passed = Radiance(ray.channels, distance, optical_depth, ray.transmittance * transmittance, ray.carry)
+        return passed, w0, w1
+
+    def _gather(self, entry: list[Any], leaving: list[Any], ray: Radiance) -> Radiance:
+        """Pass a segment whose channels are linear, too, and given behind distance and density."""
+        ray, w0, w1 = self._pass(entry[:2], leaving[:2], ray)
+        values = zip(entry[2:], leaving[2:], ray.channels, strict=True)
+        channels = [dr.fma(w0, c0, dr.fma(w1, c1, c)) for c0, c1, c in values]
+        return Radiance(channels, ray.distance, ray.optical_depth, ray.transmittance, ray.carry)
+
+    def _add(self, channels: list[Any], weight: Any, vertex: Any, active: Any) -> list[Any]:
+        values = read_channels(self.view, vertex, active)
+        return [dr.fma(weight, value, sum_) for value, sum_ in zip(values, channels, strict=True)]
 
     def goes_on(self, ray: Radiance) -> Any:
         # With a threshold of 0 the line integral is complete, however little light is left to see it by.
         return (ray.transmittance > self.view.threshold) | (self.view.threshold == 0)
 
     def leave(self, face: Face, ray: Radiance, active: Any) -> Radiance:
-        return ray
+        if not self.slots:
+            return ray
+        _distribute(face, ray.carry[0])
+        channels = ray.channels
+        for corner in face.corners:
+            channels = self._add(channels, dr.select(active, corner.adjoints[0], 0.0), corner.vertex, active)
+        carry = [dr.zeros_like(ray.carry[0])]
+        return Radiance(channels, ray.distance, ray.optical_depth, ray.transmittance, carry)
 
     def finish(self, ray: Radiance) -> None:
-        float4, pixel, valid = self.view.backend.Float4, self.rays.pixel, self.rays.valid
-        dr.scatter(self.light, float4(*ray.color, ray.optical_depth), pixel, valid)
+        view, pixel, valid = self.view, self.rays.pixel, self.rays.valid
+        view.records.scatter(view.backend, self.light, [*ray.channels, ray.optical_depth], pixel, valid)
         dr.scatter(self.distance, ray.distance, pixel, valid)
+
+
+def _distribute(face: Face, weight: Any) -> None:
+    """Give the weight of a face's crossing to its corners."""
+    for corner, share in zip(face.corners, face.weights(), strict=True):
+        corner.adjoints[0] = dr.fma(share, weight, corner.adjoints[0])

@@ -26,7 +26,16 @@ from difftetvr.mesh import TetMesh
 from difftetvr.mesh.topology.incidence import cell_edges, cell_faces
 from difftetvr.mesh.topology.topology import LOCAL_EDGE_OF, LOCAL_EDGES
 from difftetvr.rendering.kernels.adjoint import buffer_length, reduce_mode
-from difftetvr.rendering.traversal.crossing import Rays, Span, Step, Tracer, View, corner_of, read_vertex
+from difftetvr.rendering.traversal.crossing import (
+    Span,
+    Step,
+    Tracer,
+    View,
+    corner_of,
+    read_channels,
+    read_vertex,
+)
+from difftetvr.rendering.traversal.rays import Lanes
 from difftetvr.rendering.traversal.walk import Corner, Face
 
 RECORD = 12
@@ -143,7 +152,7 @@ def hat_records(tracer: Tracer, mesh: TetMesh, image: HatImage) -> HatRecords:
 class _HatKernel:
     """Gathers responses; see :class:`difftetvr.rendering.traversal.crossing.Kernel`."""
 
-    def __init__(self, tracer: Tracer, rays: Rays, tables: HatTables, records: HatRecords, image: HatImage) -> None:
+    def __init__(self, tracer: Tracer, rays: Lanes, tables: HatTables, records: HatRecords, image: HatImage) -> None:
         self.view, self.rays, self.tables, self.records = tracer.view, rays, tables, records
         self.span = Span.of(tracer, rays)
         pixel, valid = rays.pixel, rays.valid
@@ -164,6 +173,7 @@ class _HatKernel:
 
     def read(self, vertex: Any, active: Any) -> Corner:
         position, attributes = read_vertex(self.view, vertex, active)
+        attributes = [*attributes, *read_channels(self.view, vertex, active)]
         return corner_of(self.rays.frame, vertex, position, attributes, 4)
 
     def visit(self, step: Step, ray: HatRay) -> HatRay:

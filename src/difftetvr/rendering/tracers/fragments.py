@@ -14,15 +14,14 @@ import drjit as dr
 import torch
 
 from difftetvr.mesh import TetMesh
+from difftetvr.rendering.search.bundle_hits import BundleScene
+from difftetvr.rendering.search.hits import Hit
+from difftetvr.rendering.search.rasterise import for_each_hit, work_items
+from difftetvr.rendering.search.scene import NONE, Scene
+from difftetvr.rendering.search.starts import cells_around_camera
 from difftetvr.rendering.tracers.bands import Band
-from difftetvr.rendering.tracers.camera_inside import cells_around_camera
-from difftetvr.rendering.tracers.entry_table import HalfFaceScene
-from difftetvr.rendering.tracers.rasterise import Hit, for_each_hit, work_items
-from difftetvr.rendering.traversal.rays import lane_count, lane_pixel, pixel_lane
+from difftetvr.rendering.traversal.bundle import BundleRays
 from difftetvr.rendering.traversal.walk import crossing_depth, find_exit, holds_ray
-
-NONE = 0xFFFFFFFF
-"""Ends a list."""
 
 _FACES_AT_A_TIME = 1 << 22  # bounds the memory of work items
 
@@ -47,19 +46,28 @@ class FragmentLists:
 class FragmentRaster:
     """Finds the fragments of a view."""
 
-    def __init__(self, scene: HalfFaceScene, mesh: TetMesh, vertices: torch.Tensor) -> None:
+    def __init__(self, scene: Scene, mesh: TetMesh, vertices: torch.Tensor, limits: Any | None) -> None:
+        """Take the scene.
+
+        Args:
+            scene: The cells and the rays.
+            mesh: The mesh.
+            vertices: (V, 3) its vertices in the space of the rays.
+            limits: (N, 2) distances between which each ray is looked at; None for all in front of it.
+        """
         self.scene = scene
-        self.rows = 4 * mesh.num_cells
-        around = cells_around_camera(scene.backend, mesh, vertices)
+        self.half_faces = 4 * mesh.num_cells
+        self.bundle = BundleScene(scene, mesh, vertices, limits) if isinstance(scene.rays, BundleRays) else None
+        around = None if self.bundle else cells_around_camera(scene.backend, mesh, vertices)
         self.around = None if around is None else scene.backend.uints(around)
 
     def count(self) -> torch.Tensor:
         """(lanes,) int64 number of fragments of each lane: its depth complexity."""
         uint = self.scene.backend.UInt
-        counts = dr.zeros(uint, lane_count(self.scene.camera.width, self.scene.camera.height))
+        counts = dr.zeros(uint, self.scene.rays.lane_count)
 
         def add(hit: Hit) -> None:
-            dr.scatter_add(counts, uint(1), pixel_lane(self.scene.rays, hit.column, hit.row), hit.is_hit)
+            dr.scatter_add(counts, uint(1), hit.lane, hit.is_hit)
 
         self._for_each(add, counts)
         return self.scene.backend.tensor(self.scene.backend.Int(counts)).long()
@@ -78,41 +86,45 @@ class FragmentRaster:
         first, last = backend.opaque_uint(band.first), backend.opaque_uint(band.last)
 
         def push(hit: Hit) -> None:
-            lane = pixel_lane(self.scene.rays, hit.column, hit.row)
-            is_hit = hit.is_hit & (lane >= first) & (lane < last)
+            is_hit = hit.is_hit & (hit.lane >= first) & (hit.lane < last)
             node = dr.scatter_inc(used, uint(0), is_hit)
-            before = dr.scatter_exch(lists.heads, node, lane - first, is_hit)
+            before = dr.scatter_exch(lists.heads, node, hit.lane - first, is_hit)
             dr.scatter(lists.following, before, node, is_hit)
-            dr.scatter(lists.faces, hit.face, node, is_hit)
+            dr.scatter(lists.faces, hit.half_face, node, is_hit)
             dr.scatter(lists.depths, hit.depth, node, is_hit)
 
         self._for_each(push, lists)
         return lists
 
     def _for_each(self, visit: Any, results: Any) -> None:
-        self.scene.backend.run(results)
-        for begin in range(0, self.rows, _FACES_AT_A_TIME):
-            items = work_items(self.scene, begin, min(begin + _FACES_AT_A_TIME, self.rows))
+        backend = self.scene.backend
+        backend.run(results)
+        if self.bundle is not None:
+            self.bundle.for_each_fragment(visit)
+            backend.run(results)
+            return
+        for begin in range(0, self.half_faces, _FACES_AT_A_TIME):
+            count = min(_FACES_AT_A_TIME, self.half_faces - begin)
+            items = work_items(self.scene, dr.arange(backend.UInt, count) + backend.opaque_uint(begin))
             for_each_hit(self.scene, items, visit)
-            self.scene.backend.run(results)
+            backend.run(results)
         if self.around is not None:
             self._for_each_around(visit)
-            self.scene.backend.run(results)
+            backend.run(results)
 
     def _for_each_around(self, visit: Any) -> None:
         """Crossings of cells that hold the camera: they begin behind it, where no face is rasterised."""
         scene, uint = self.scene, self.scene.backend.UInt
-        lanes = lane_count(scene.camera.width, scene.camera.height)
-        column, row, valid = lane_pixel(scene.rays, dr.arange(uint, lanes))
-        frame = scene.rays.frame(column, row)
+        lane = dr.arange(uint, scene.rays.lane_count)
+        rays = scene.rays.of_lanes(lane)
         count = scene.backend.opaque_uint(4 * dr.width(self.around))
 
         def body(index: Any) -> tuple[Any]:
             half_face = 4 * dr.gather(uint, self.around, index >> 2) + (index & 3)
-            face = scene.face(frame, half_face)
-            apex = scene.corner(frame, scene.indices_and_apex(half_face)[3])
+            face, apex = scene.face_and_apex(rays.frame, half_face)
             depth, exit_depth = crossing_depth(face), crossing_depth(find_exit(face, apex).face(face, apex))
-            visit(Hit(column, row, half_face, depth, valid & holds_ray(face) & (depth <= 0) & (exit_depth > 0)))
+            is_hit = rays.valid & holds_ray(face) & (depth <= 0) & (exit_depth > 0)
+            visit(Hit(rays.pixel, lane, half_face, depth, is_hit))
             return (index + 1,)
 
-        dr.while_loop((dr.zeros(uint, dr.width(column)),), lambda index: index < count, body)
+        dr.while_loop((dr.zeros(uint, scene.rays.lane_count),), lambda index: index < count, body)

@@ -16,10 +16,11 @@ import torch
 
 from difftetvr.backend import Backend
 from difftetvr.mesh import TetMesh
+from difftetvr.rendering.search.scene import NONE, Scene
 from difftetvr.rendering.tracers.bands import Band, bands_of
-from difftetvr.rendering.tracers.entry_table import HalfFaceScene
-from difftetvr.rendering.tracers.fragments import NONE, FragmentLists, FragmentRaster
-from difftetvr.rendering.traversal.crossing import Kernel, Rays, View, cross_cell, make_rays
+from difftetvr.rendering.tracers.fragments import FragmentLists, FragmentRaster
+from difftetvr.rendering.traversal.crossing import Kernel, View, cross_cell, lanes_of
+from difftetvr.rendering.traversal.rays import Lanes
 
 FRAGMENT_BUDGET = 1 << 26
 """Fragments that lists may hold at a time, of 12 bytes each in float32."""
@@ -46,8 +47,8 @@ class LinkedList:
 
     @staticmethod
     def of(view: View, mesh: TetMesh, vertices: torch.Tensor) -> LinkedList:
-        """Prepare a view of a mesh with (V, 3) vertices in camera space."""
-        raster = FragmentRaster(HalfFaceScene.of(view.backend, view.camera, mesh, vertices), mesh, vertices)
+        """Prepare a view of a mesh with (V, 3) vertices in the space of the rays."""
+        raster = FragmentRaster(Scene.of(view.backend, view.rays, mesh, vertices), mesh, vertices, view.limits)
         counts = raster.count()
         longest = int(counts.max())
         size = next((size for size in LOCAL_SIZES if size >= longest), LOCAL_SIZES[-1])
@@ -58,16 +59,16 @@ class LinkedList:
         """Whether some crossings begin behind the camera."""
         return self.raster.around is not None
 
-    def trace(self, make_kernel: Callable[[Rays], Kernel]) -> None:
+    def trace(self, make_kernel: Callable[[Lanes], Kernel]) -> None:
         """Sort every ray's fragments and cross their cells, front to back."""
         for band in self.bands:
             lists = self.raster.lists(band)
-            rays = make_rays(self.view, band.first, band.last)
+            rays = lanes_of(self.view, band.first, band.last)
             kernel = make_kernel(rays)
             kernel.finish(self._resolve(kernel, rays, lists))
             self.view.backend.run()  # before the lists of the next band
 
-    def _resolve(self, kernel: Kernel, rays: Rays, lists: FragmentLists) -> Any:
+    def _resolve(self, kernel: Kernel, rays: Lanes, lists: FragmentLists) -> Any:
         view, scene = self.view, self.raster.scene
         uint, real, lanes = view.backend.UInt, view.backend.Float, dr.width(rays.pixel)
         heads = dr.gather(uint, lists.heads, dr.arange(uint, lanes), rays.valid)

@@ -13,8 +13,10 @@ import drjit as dr
 import torch
 
 from difftetvr.mesh import TetMesh
-from difftetvr.rendering.tracers.entry import EntryLists, find_entries
-from difftetvr.rendering.traversal.crossing import Kernel, Rays, Step, View, make_rays
+from difftetvr.rendering.search.entry import EntryLists, find_entries
+from difftetvr.rendering.search.scene import Scene
+from difftetvr.rendering.traversal.crossing import Kernel, Step, View, lanes_of
+from difftetvr.rendering.traversal.rays import Lanes
 from difftetvr.rendering.traversal.walk import BOUNDARY, Face, interpolate, make_face, table_row, walk_table
 
 
@@ -24,44 +26,45 @@ class Marching:
 
     Attributes:
         view: What kernels read.
+        scene: The cells.
         table: Walk table, see :func:`difftetvr.rendering.traversal.walk.walk_table`.
         entries: Entry lists of this view.
     """
 
     view: View
+    scene: Scene
     table: Any
     entries: EntryLists
 
     @staticmethod
     def of(view: View, mesh: TetMesh, vertices: torch.Tensor) -> Marching:
-        """Prepare a view of a mesh with (V, 3) vertices in camera space."""
+        """Prepare a view of a mesh with (V, 3) vertices in the space of the rays."""
         table = view.backend.uints(walk_table(mesh))
-        return Marching(view, table, find_entries(view.backend, mesh, vertices, view.camera))
+        scene = Scene.of(view.backend, view.rays, mesh, vertices)
+        return Marching(view, scene, table, find_entries(scene, mesh, vertices, view.limits))
 
     @property
     def starts_inside(self) -> bool:
-        """Whether some walks start behind the camera."""
-        return self.entries.camera_inside
+        """Whether some walks start behind the ray's origin."""
+        return self.entries.has_starts
 
-    def trace(self, make_kernel: Callable[[Rays], Kernel]) -> None:
+    def trace(self, make_kernel: Callable[[Lanes], Kernel]) -> None:
         """Walk every ray through all cells it crosses, front to back."""
-        rays = make_rays(self.view)
+        rays = lanes_of(self.view)
         kernel = make_kernel(rays)
         kernel.finish(self._walk(kernel, rays))
 
-    def _walk(self, kernel: Kernel, rays: Rays) -> Any:
+    def _walk(self, kernel: Kernel, rays: Lanes) -> Any:
         uint = self.view.backend.UInt
         offset = dr.gather(uint, self.entries.offset, rays.pixel, rays.valid)
         count = dr.gather(uint, self.entries.count, rays.pixel, rays.valid)
 
         def enter(index: Any, ray: Any) -> tuple[Any, Any]:
             active = (index < count) & rays.valid
-            row = dr.gather(uint, self.entries.rows, offset + index, active)
-            cell = dr.gather(uint, self.entries.cells, row, active)
-            apex = dr.gather(uint, self.entries.apices, row, active)
-            vertices = [dr.gather(uint, self.entries.corners, 3 * row + k, active) for k in range(3)]
+            half_face = dr.gather(uint, self.entries.half_faces, offset + index, active)
+            *vertices, apex = self.scene.indices_and_apex(half_face, active)
             face = make_face([kernel.read(vertex, active) for vertex in vertices])
-            state = (active, cell, apex, face, interpolate(face), ray)
+            state = (active, half_face >> 2, apex, face, interpolate(face), ray)
             state = dr.while_loop(state, lambda active, *_: active, advance)
             return index + 1, kernel.leave(state[3], state[5], active)
 

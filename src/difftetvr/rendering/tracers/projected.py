@@ -16,12 +16,11 @@ import drjit as dr
 import torch
 
 from difftetvr.mesh import TetMesh
-from difftetvr.mesh.topology.topology import LOCAL_FACES
+from difftetvr.rendering.search.scene import Scene
 from difftetvr.rendering.tracers.cell_order import visibility_order
-from difftetvr.rendering.tracers.entry_table import HalfFaceScene
 from difftetvr.rendering.tracers.tiles import TILE_BITS, TileLists, Tiler
-from difftetvr.rendering.traversal.crossing import Kernel, Rays, View, cross_cell, make_rays
-from difftetvr.rendering.traversal.rays import edge_function, is_left
+from difftetvr.rendering.traversal.crossing import Kernel, View, cross_cell, lanes_of
+from difftetvr.rendering.traversal.rays import Lanes
 
 PAIR_BUDGET = 1 << 23
 """Pairs of cell and tile that are held at a time."""
@@ -43,7 +42,7 @@ class Projected:
     """
 
     view: View
-    scene: HalfFaceScene
+    scene: Scene
     tiler: Tiler
     starts_inside: bool
 
@@ -59,13 +58,13 @@ class Projected:
                 OrderWarning,
                 stacklevel=2,
             )
-        scene = HalfFaceScene.of(view.backend, view.camera, mesh, vertices)
+        scene = Scene.of(view.backend, view.rays, mesh, vertices)
         starts_inside = bool(vertices.detach()[:, 2].amin() <= 0)
         return Projected(view, scene, Tiler(scene, cells.order, PAIR_BUDGET), starts_inside)
 
-    def trace(self, make_kernel: Callable[[Rays], Kernel]) -> None:
+    def trace(self, make_kernel: Callable[[Lanes], Kernel]) -> None:
         """Cross the cells of every tile, front to back."""
-        rays = make_rays(self.view)
+        rays = lanes_of(self.view)
         kernel = make_kernel(rays)
         ray = kernel.start()
         for part in self.tiler.parts:
@@ -73,16 +72,15 @@ class Projected:
             self.view.backend.run(ray)
         kernel.finish(ray)
 
-    def _composite(self, kernel: Kernel, rays: Rays, lists: TileLists, ray: Any) -> Any:
-        uint, width = self.view.backend.UInt, self.scene.rays.width
+    def _composite(self, kernel: Kernel, rays: Lanes, lists: TileLists, ray: Any) -> Any:
+        uint, width = self.view.backend.UInt, self.scene.image.width
         row = rays.pixel // width
         tile = (row >> TILE_BITS) * self.tiler.columns + ((rays.pixel - row * width) >> TILE_BITS)
         end = dr.gather(uint, lists.end, tile, rays.valid)
 
         def cross(index: Any, ray: Any) -> tuple[Any, Any]:
             cell = dr.gather(uint, lists.cells, index)
-            is_hit, local = self._entry(rays, cell)
-            half_face = 4 * cell + local
+            is_hit, half_face = self.scene.entered(rays.frame, cell)
 
             def hit(ray: Any) -> Any:
                 return cross_cell(kernel, cell, self.scene.indices_and_apex(half_face), ray, True)
@@ -93,22 +91,3 @@ class Projected:
         state = (dr.gather(uint, lists.begin, tile, rays.valid), ray)
         more = lambda index, ray: (index < end) & kernel.goes_on(ray)  # noqa: E731
         return dr.while_loop(state, more, cross)[1]
-
-    def _entry(self, rays: Rays, cell: Any) -> tuple[Any, Any]:
-        """Whether a ray crosses a cell, and the local face through which it enters."""
-        uint = self.view.backend.UInt
-        tet = dr.gather(self.view.backend.UInt4, self.scene.tets, cell)
-        points = [rays.frame.project(*self.scene.point(tet[k])) for k in range(4)]
-        left: dict[tuple[int, int], Any] = {}
-        for i in range(4):
-            for j in range(i + 1, 4):
-                (pa, pb, _), (qa, qb, _) = points[i], points[j]
-                left[i, j] = is_left(edge_function(pa, pb, qa, qb), pa, pb, qa, qb)
-                left[j, i] = ~left[i, j]
-        is_hit, local = None, uint(0)
-        for k, (i, j, m) in enumerate(LOCAL_FACES):
-            # Counter-clockwise from outside is clockwise in the ray's plane.
-            holds = left[i, m] & left[m, j] & left[j, i]
-            is_hit = holds if is_hit is None else is_hit | holds
-            local = dr.select(holds, uint(k), local)
-        return is_hit, local

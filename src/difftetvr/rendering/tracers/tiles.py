@@ -8,8 +8,8 @@ from typing import Any
 import drjit as dr
 import torch
 
+from difftetvr.rendering.search.scene import Scene
 from difftetvr.rendering.tracers.bands import bands_of
-from difftetvr.rendering.tracers.entry_table import HalfFaceScene
 
 TILE_BITS = 2
 """Tiles have 4 x 4 pixels: those of 16 lanes that lie side by side in Morton order, a vector of AVX-512."""
@@ -32,21 +32,22 @@ class TileLists:
 class Tiler:
     """Sorts the cells of a view into tiles, some at a time."""
 
-    def __init__(self, scene: HalfFaceScene, order: torch.Tensor, budget: int) -> None:
+    def __init__(self, scene: Scene, order: torch.Tensor, budget: int) -> None:
         """Find the tiles of each cell.
 
         Args:
-            scene: The cells and the camera.
+            scene: The cells, and the rays of a camera.
             order: (T,) cell indices, front to back.
             budget: Pairs of cell and tile to hold at a time; a single cell may have more.
         """
         self.scene = scene
-        self.columns = _tiles(scene.camera.width)
-        self.count = self.columns * _tiles(scene.camera.height)
+        width, height = scene.image.size
+        self.columns = _tiles(width)
+        self.count = self.columns * _tiles(height)
         backend, uint = scene.backend, scene.backend.UInt
         cell = backend.uints(order.to(torch.int32))
-        corners = dr.gather(backend.UInt4, scene.tets, cell)
-        columns, rows, visible = scene.rays.pixel_range(scene.backend, [scene.point(corners[k]) for k in range(4)])
+        corners = scene.cell(cell)
+        columns, rows, visible = scene.image.pixel_range(scene.backend, [scene.point(corners[k]) for k in range(4)])
         shift = lambda value: uint(dr.select(visible, value, 0)) >> TILE_BITS  # noqa: E731
         column0, column1, row0, row1 = (shift(value) for value in (*columns, *rows))
         self.width = backend.Int(column1 - column0 + 1)

@@ -15,69 +15,71 @@ import drjit as dr
 
 from difftetvr.backend import Backend
 from difftetvr.optics import OpticalModel
-from difftetvr.rendering.cameras.pinhole import Camera
-from difftetvr.rendering.traversal.rays import Frame, lane_count, lane_pixel
+from difftetvr.rendering.traversal.rays import Frame, KernelRays, Lanes
+from difftetvr.rendering.traversal.records import PACKET, Records, gather_values, packets_of
 from difftetvr.rendering.traversal.transfer import Transfer
 from difftetvr.rendering.traversal.walk import Corner, Exit, Face, find_exit, interpolate, make_face
 
 
 @dataclass
 class View:
-    """What kernels read of a mesh with its field, seen from a camera, as flat Dr.Jit arrays.
+    """What kernels read of a mesh with its field, seen along some rays, as flat Dr.Jit arrays.
 
     Attributes:
         backend: Array types.
-        camera: Image size (the intrinsics are read from the device).
+        rays: The rays.
         optics: Optical model of one cell.
-        vertices: Vertex records: (V, 4) x, y, z in camera space and the scalar, 0 for per-cell fields; or (V, 8)
-            x, y, z, density, linear RGB and 0, so that one cache line holds all of a vertex.
-        cells: (T, 4) linear RGB and density for per-cell fields, else None.
-        transfer: Transfer function of the vertices' scalars, None where vertices have densities and colours.
+        channels: Number of channels C that are seen.
+        vertices: Vertex records: (V, 4) x, y, z and the scalar, 0 for per-cell fields; or x, y, z, density, then the
+            channels in whole packets of four, so that for RGB one cache line holds all of a vertex.
+        cells: Records of channels and density for per-cell fields, see
+            :class:`difftetvr.rendering.traversal.records.Records`; else None.
+        transfer: Transfer function of the vertices' scalars, None where vertices have densities and channels.
         threshold: Transmittance at or below which light counts as gone, as a device value.
-        limits: (H, W, 2) distances between which each ray is looked at, None for all in front of the camera.
+        limits: (N, 2) distances between which each ray is looked at, None for all in front of its origin.
     """
 
     backend: Backend
-    camera: Camera
+    rays: KernelRays
     optics: OpticalModel
+    channels: int
     vertices: Any
     cells: Any | None
     transfer: Transfer | None
     threshold: Any
     limits: Any | None
 
+    @property
+    def records(self) -> Records:
+        """Layout of what a ray gathers, and of what a vertex or cell holds."""
+        return Records(self.channels)
 
-def vertex_records(backend: Backend, vertices: Any, density: Any, color: Any) -> Any:
-    """Flat (V, 8) records x, y, z, density, red, green, blue, 0 from flat arrays, in one pass on all cores."""
-    real = backend.Float
+    @property
+    def has_vertex_channels(self) -> bool:
+        """Whether channels are those of vertices, which rays gather as they drop them."""
+        return self.channels > 0 and self.cells is None and self.transfer is None
+
+
+def vertex_records(backend: Backend, vertices: Any, density: Any, channels: Any, count: int) -> Any:
+    """Flat records x, y, z, density and ``count`` channels from flat arrays, in one pass on all cores."""
+    real, stride = backend.Float, 1 + packets_of(count)
     vertex = dr.arange(backend.UInt, dr.width(density))
-    x, y, z = (dr.gather(real, vertices, 3 * vertex + k) for k in range(3))
-    r, g, b = (dr.gather(real, color, 3 * vertex + k) for k in range(3))
-    records = dr.empty(real, 8 * dr.width(density))
-    dr.scatter(records, backend.Float4(x, y, z, density), 2 * vertex)
-    dr.scatter(records, backend.Float4(r, g, b, real(0)), 2 * vertex + 1)
+    position = [dr.gather(real, vertices, 3 * vertex + k) for k in range(3)]
+    values = [*position, density, *(dr.gather(real, channels, count * vertex + k) for k in range(count))]
+    values += [real(0)] * (PACKET * stride - len(values))
+    records = dr.empty(real, PACKET * stride * dr.width(density))
+    for k in range(stride):
+        dr.scatter(records, backend.Float4(*values[PACKET * k : PACKET * (k + 1)]), stride * vertex + k)
     backend.run(records)
     return records
 
 
-@dataclass
-class Rays:
-    """The rays of a kernel's lanes."""
-
-    pixel: Any
-    valid: Any
-    frame: Frame
-
-
-def make_rays(view: View, first: int = 0, last: int | None = None) -> Rays:
-    """Rays of all pixels, one a lane, in Morton order; or those of the lanes from ``first`` to before ``last``."""
-    uint = view.backend.UInt
-    camera = view.camera.kernel_rays(view.backend)
-    lane = dr.arange(uint, (lane_count(view.camera.width, view.camera.height) if last is None else last) - first)
+def lanes_of(view: View, first: int = 0, last: int | None = None) -> Lanes:
+    """All rays of a view, one a lane; or those of the lanes from ``first`` to before ``last``."""
+    lane = dr.arange(view.backend.UInt, (view.rays.lane_count if last is None else last) - first)
     if first:
         lane += view.backend.opaque_uint(first)
-    column, row, valid = lane_pixel(camera, lane)
-    return Rays(row * camera.width + column, valid, camera.frame(column, row))
+    return view.rays.of_lanes(lane)
 
 
 @dataclass
@@ -129,7 +131,7 @@ class Tracer(Protocol):
     starts_inside: bool
     """Whether some crossings begin behind the camera and must be clipped there."""
 
-    def trace(self, make_kernel: Callable[[Rays], Kernel]) -> None:
+    def trace(self, make_kernel: Callable[[Lanes], Kernel]) -> None:
         """Run a kernel on all crossings."""
 
 
@@ -154,16 +156,16 @@ def cross_cell(kernel: Kernel, cell: Any, vertices: list[Any], ray: Any, active:
 
 
 def read_vertex(view: View, vertex: Any, active: Any) -> tuple[Any, list[Any]]:
-    """A vertex's position record and its attributes: density and linear RGB, a scalar, or none for per-cell fields."""
-    float4 = view.backend.Float4
-    if view.transfer is not None:
-        position = dr.gather(float4, view.vertices, vertex, active)
-        return position, [position[3]]
-    if view.cells is not None:
-        return dr.gather(float4, view.vertices, vertex, active), []
-    position = dr.gather(float4, view.vertices, 2 * vertex, active)
-    color = dr.gather(float4, view.vertices, 2 * vertex + 1, active)
-    return position, [position[3], color[0], color[1], color[2]]
+    """A vertex's position record and its attribute: density, a scalar, or none for per-cell fields."""
+    stride = 1 + packets_of(view.channels) if view.has_vertex_channels else 1
+    position = dr.gather(view.backend.Float4, view.vertices, stride * vertex if stride > 1 else vertex, active)
+    return position, [] if view.cells is not None else [position[3]]
+
+
+def read_channels(view: View, vertex: Any, active: Any) -> list[Any]:
+    """A vertex's channels."""
+    first = (1 + packets_of(view.channels)) * vertex + 1
+    return gather_values(view.backend, view.vertices, first, view.channels, active)
 
 
 def corner_of(frame: Frame, vertex: Any, record: Any, values: list[Any], adjoints: int) -> Corner:
@@ -186,7 +188,7 @@ class Span:
     far: Any | None
 
     @staticmethod
-    def of(tracer: Tracer, rays: Rays) -> Span | None:
+    def of(tracer: Tracer, rays: Lanes) -> Span | None:
         """What the view asks for; None where nothing has to be clipped."""
         view = tracer.view
         if view.limits is not None:
@@ -225,3 +227,9 @@ class Clip:
         return [
             dr.select(self.at_far, dr.fma(self.last, v1 - v0, v0), v1) for v0, v1 in zip(entry, leaving, strict=True)
         ]
+
+    def unclipped(self, at_start: Any, at_end: Any) -> tuple[Any, Any]:
+        """Weights of the crossing's own ends from those of the part's: the transpose of :meth:`start`, :meth:`end`."""
+        last = dr.select(self.at_far, self.last, 1.0)
+        entry = dr.fma(1.0 - self.first, at_start, (1.0 - last) * at_end)
+        return entry, dr.fma(self.first, at_start, last * at_end)

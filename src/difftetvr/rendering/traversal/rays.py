@@ -1,8 +1,8 @@
-"""Pixels, rays and the exact 2-D predicates that every renderer shares (Dr.Jit).
+"""Rays, their pixels, and the exact 2-D predicates that every renderer shares (Dr.Jit).
 
-Each ray has an orthonormal frame (a, b, direction) with a x b = direction, and starts at the camera, the origin of
-camera space. A vertex seen by a ray is (a, b, t): its offset from the ray's line and its distance along it. Whether a
-ray meets a face is decided by signs of 2-D edge functions of (a, b) alone, never by comparing distances.
+Each ray has an orthonormal frame (a, b, direction) with a x b = direction. A vertex seen by a ray is (a, b, t): its
+offset from the ray's line and its distance along it. Whether a ray meets a face is decided by signs of 2-D edge
+functions of (a, b) alone, never by comparing distances.
 """
 
 from __future__ import annotations
@@ -19,32 +19,89 @@ _BLOCK_BITS = 6  # pixels are visited in Morton order inside blocks of 64 x 64
 
 @dataclass
 class Frame:
-    """Orthonormal frame of a ray; each axis is a tuple of three Dr.Jit floats in camera space."""
+    """Orthonormal frame of a ray; each axis is a tuple of three Dr.Jit floats in the space of the vertices.
+
+    Attributes:
+        a, b, direction: The axes.
+        origin: Where the ray starts, likewise; None for that space's own origin, where a camera is.
+    """
 
     a: tuple[Any, Any, Any]
     b: tuple[Any, Any, Any]
     direction: tuple[Any, Any, Any]
+    origin: tuple[Any, Any, Any] | None = None
+
+    @staticmethod
+    def along(direction: tuple[Any, Any, Any], origin: tuple[Any, Any, Any]) -> Frame:
+        """Frame of a ray of any unit direction (Duff et al. 2017)."""
+        x, y, z = direction
+        sign = dr.copysign(type(z)(1), z)
+        inverse = -1.0 / (sign + z)
+        xy = x * y * inverse
+        a = (dr.fma(sign * x * x, inverse, 1.0), sign * xy, -sign * x)
+        return Frame(a, (xy, dr.fma(y * y, inverse, sign), -y), direction, origin)
 
     def project(self, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
-        """Coordinates (a, b, t) of a camera-space point; explicit fma, so that every kernel rounds alike."""
+        """Coordinates (a, b, t) of a point; explicit fma, so that every kernel rounds alike."""
+        if self.origin is not None:
+            x, y, z = x - self.origin[0], y - self.origin[1], z - self.origin[2]
         return tuple(dr.fma(e[0], x, dr.fma(e[1], y, e[2] * z)) for e in (self.a, self.b, self.direction))
 
-    def to_camera_space(self, a: Any, b: Any, t: Any) -> tuple[Any, Any, Any]:
-        """A vector given in this frame, in camera space."""
+    def unproject(self, a: Any, b: Any, t: Any) -> tuple[Any, Any, Any]:
+        """A vector given in this frame, in the space of the vertices."""
         return tuple(dr.fma(self.a[k], a, dr.fma(self.b[k], b, self.direction[k] * t)) for k in range(3))
 
 
-class CameraRays(Protocol):
-    """What kernels ask of a camera, in device values. A camera model is a camera and one of these beside it.
+@dataclass
+class Lanes:
+    """The rays of a kernel's lanes.
 
-    Rays start at the origin of camera space. Attributes hold the image's size in pixels.
+    Attributes:
+        pixel: Index of each ray's pixel in the image, row by row, or of the ray in its bundle.
+        valid: Whether a lane has one.
+        frame: Where the rays run.
+    """
+
+    pixel: Any
+    valid: Any
+    frame: Frame
+
+
+class KernelRays(Protocol):
+    """The rays of a view as kernels read them, in device values."""
+
+    @property
+    def count(self) -> int:
+        """Number of rays."""
+        ...
+
+    @property
+    def lane_count(self) -> int:
+        """Number of lanes that a kernel needs for them: some may have no ray."""
+        ...
+
+    def of_lanes(self, lane: Any) -> Lanes:
+        """The rays of some lanes; explicit fma, so that every kernel rounds alike."""
+        ...
+
+    def of_pixels(self, pixel: Any) -> Frame:
+        """Frames of the rays of some pixels, the same as in their lanes."""
+        ...
+
+
+class ImageRays(KernelRays, Protocol):
+    """Rays of a camera, from the origin through the pixels of an image.
+
+    Attributes hold the image's size in pixels, ``size`` on the host: (width, height). A camera model that can be
+    rasterised is a camera and one of these beside it.
     """
 
     width: Any
     height: Any
+    size: tuple[int, int]
 
     def frame(self, column: Any, row: Any) -> Frame:
-        """Frame of the ray of a pixel; explicit fma, so that every kernel rounds alike."""
+        """Frame of the ray of a pixel."""
         ...
 
     def pixel_range(self, backend: Backend, points: list[list[Any]]) -> tuple[tuple[Any, Any], tuple[Any, Any], Any]:
@@ -76,7 +133,7 @@ def lane_count(width: int, height: int) -> int:
     return -(-width // block) * -(-height // block) * block * block
 
 
-def lane_pixel(image: CameraRays, lane: Any) -> tuple[Any, Any, Any]:
+def lane_pixel(image: ImageRays, lane: Any) -> tuple[Any, Any, Any]:
     """Column, row and validity of a lane: neighbouring lanes see neighbouring pixels, so rays share cells in cache."""
     mask = (1 << _BLOCK_BITS) - 1
     blocks_per_row = (image.width + mask) >> _BLOCK_BITS
@@ -88,7 +145,7 @@ def lane_pixel(image: CameraRays, lane: Any) -> tuple[Any, Any, Any]:
     return column, row, (column < image.width) & (row < image.height)
 
 
-def pixel_lane(image: CameraRays, column: Any, row: Any) -> Any:
+def pixel_lane(image: ImageRays, column: Any, row: Any) -> Any:
     """The lane of a pixel: the inverse of :func:`lane_pixel`."""
     mask = (1 << _BLOCK_BITS) - 1
     blocks_per_row = (image.width + mask) >> _BLOCK_BITS

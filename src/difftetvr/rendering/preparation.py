@@ -1,0 +1,300 @@
+"""From what callers pass to what kernels take: checks, the space of the rays, precision and units."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, TypeGuard
+
+import torch
+
+from difftetvr.backend import Backend, backend_for, require_own_threads
+from difftetvr.errors import DiffTetError, MeshError, shown
+from difftetvr.inputs import as_number, require_type
+from difftetvr.mesh import Field, TetMesh
+from difftetvr.optics import ConstantPerCell, ExactLinear, OpticalModel
+from difftetvr.rendering.autograd import TRACERS, Content, RenderTask
+from difftetvr.rendering.cameras.pinhole import Camera
+from difftetvr.rendering.clip_plane import clip_limits, clip_rays
+from difftetvr.rendering.rays import Rays, RaySource, image_order
+from difftetvr.rendering.scalar_field import ScalarField
+
+RENDERERS = tuple(TRACERS)
+CAMERAS = "pass a difftetvr.Camera, a list of cameras, or difftetvr.Rays"
+_REMOTE = 64.0  # distances of sizes of the mesh from which float32 loses more than the tests allow it
+_KNOW_FLOAT64 = ("cpu", "cuda")
+_SMALL = 1e-6  # within this and its inverse, coordinates are left as they are
+
+
+@dataclass(frozen=True)
+class ViewOptions:
+    """How a view is rendered; see :func:`difftetvr.render`."""
+
+    optics: OpticalModel | None = None
+    transmittance_threshold: float = 0.0
+    deterministic: bool = False
+    renderer: str = "marching"
+
+
+@dataclass(frozen=True)
+class PreparedView:
+    """A view as kernels take it.
+
+    Attributes:
+        task: What it needs besides tensors that may require gradients.
+        shape: Of the image or bundle; N is the number of its rays.
+        vertices: (V, 3) in camera space or that of the rays, in a unit in which products neither vanish nor overflow.
+        parts: What the volume holds, see :data:`difftetvr.rendering.autograd.Content`; densities are in that unit.
+        unit: The unit, in world units.
+        bundle: The rays, where they are not a camera's.
+    """
+
+    task: RenderTask
+    shape: tuple[int, ...]
+    vertices: torch.Tensor
+    parts: tuple[torch.Tensor, ...]
+    unit: float
+    bundle: PreparedRays | None
+
+    @property
+    def lines(self) -> torch.Tensor | None:
+        """(N, 6) origins and unit directions of the rays, in that unit; None where they are a camera's."""
+        return None if self.bundle is None else self.bundle.lines
+
+    def limits(self, clip_plane: Any) -> torch.Tensor | None:
+        """(N, 2) distances in that unit between which rays are looked at, before a plane if there is one.
+
+        None for all in front of their origins.
+        """
+        origin, like = self.task.mesh.origin, self.vertices
+        if self.bundle is None:
+            assert self.task.camera is not None
+            if clip_plane is None:
+                return None
+            return clip_limits(clip_plane, self.task.camera, like, origin).reshape(-1, 2) / self.unit
+        return self.bundle.limits(clip_plane, origin, self.unit)
+
+    def world_distance(self, light: torch.Tensor, distance: torch.Tensor) -> torch.Tensor:
+        """(N,) integral of the distance from the rays' true origins, in world units, from a kernel's outputs."""
+        distance = distance if self.unit == 1.0 else distance * self.unit
+        if self.bundle is None:
+            return distance
+        alpha = -torch.expm1(-light[:, self.task.channels])
+        return distance + alpha * self.bundle.shift.to(distance)
+
+
+@dataclass(frozen=True)
+class PreparedRays:
+    """A bundle of rays, each counted from where it is nearest to the mesh's centre: there, float32 resolves most.
+
+    Attributes:
+        lines: (N, 6) origins and unit directions, the origins in the unit of kernels.
+        shift: (N,) how far these origins are from the true ones, in world units.
+        near, far: (N,) distances from the true origins between which rays are looked at, in world units.
+        sees_all: Whether no ray starts or ends near the mesh.
+        origins: (N, 3) the true origins, relative to that of the mesh.
+        directions: (N, 3) unit directions.
+    """
+
+    lines: torch.Tensor
+    shift: torch.Tensor
+    near: torch.Tensor
+    far: torch.Tensor
+    sees_all: bool
+    origins: torch.Tensor
+    directions: torch.Tensor
+
+    @staticmethod
+    def of(rays: Rays, mesh: TetMesh) -> PreparedRays:
+        """Count rays anew from near a mesh; differentiable in them."""
+        device = mesh.vertices.device
+        dtype = torch.float64 if device.type in _KNOW_FLOAT64 else mesh.vertices.dtype
+        rays = rays.relative_to(mesh.origin)
+        origins, directions = (part.reshape(-1, 3).to(device, dtype) for part in (rays.origins, rays.directions))
+        near, far = (end.reshape(-1).to(device, dtype) for end in rays.ends)
+        directions = torch.nn.functional.normalize(directions, dim=1, eps=0.0)
+        low, high = torch.aminmax(mesh.vertices.detach().to(dtype), dim=0)
+        center, radius = 0.5 * (low + high), 0.5 * (high - low).square().sum().sqrt()
+        shift = ((center - origins.detach()) * directions.detach()).sum(1)
+        lines = torch.cat((origins + shift[:, None] * directions, directions), dim=1)
+        beyond = (shift.abs() + radius).mul(1.0 + 1e-5)
+        is_fixed = not (near.requires_grad or far.requires_grad)
+        sees_all = is_fixed and bool(((near <= shift - 1.001 * radius) & (far >= beyond)).all())
+        return PreparedRays(lines, shift, near, far, sees_all, origins, directions)
+
+    def limits(self, clip_plane: Any, origin: Sequence[float], unit: float) -> torch.Tensor | None:
+        """(N, 2) distances from these origins in the unit of kernels; None where nothing is cut off."""
+        if clip_plane is None and self.sees_all:
+            return None
+        near, far = self.near, self.far
+        if clip_plane is not None:
+            first, last = clip_rays(clip_plane, self.origins, self.directions, origin)
+            near, far = torch.maximum(near, first), torch.minimum(far, last)
+        return torch.stack((near - self.shift, far - self.shift), dim=1) / unit
+
+
+def prepare_view(
+    mesh: TetMesh, field: Field | ScalarField, camera: RaySource | Rays, options: ViewOptions
+) -> PreparedView:
+    """Check a view's inputs and bring them to kernels; arguments and errors are those of :func:`difftetvr.render`."""
+    options = _checked(mesh, field, camera, options)
+    require_own_threads()  # here already, since in a copy of a process torch may hang, too
+    source = camera.relative_to(mesh.origin) if _is_plain(camera) else as_rays(camera)
+    content, parts = _content(mesh, field, source)
+    for tensor in parts:
+        if tensor.device != mesh.vertices.device:
+            raise MeshError(
+                f"The field is on '{tensor.device}', the mesh on '{mesh.vertices.device}'; move one of them."
+            )
+    order: torch.Tensor | None = None
+    bundle: PreparedRays | None = None
+    shape: tuple[int, ...]
+    if isinstance(source, Camera):
+        positions, shape = _camera_space(mesh, source), (source.height, source.width)
+    else:
+        positions, shape = mesh.vertices, tuple(source.shape)
+        places = image_order(shape)
+        order = None if places is None else torch.from_numpy(places).to(positions.device)
+        bundle = PreparedRays.of(source, mesh)
+    backend = backend_for(positions)
+    parts = tuple(part.to(backend.dtype) for part in parts)
+    if content != "scalar":
+        Field(parts[0], parts[1], content).validate(mesh)
+    optics = options.optics or (ConstantPerCell() if content == "cell" else ExactLinear())
+    vertices, unit = _unit_of_length(positions, mesh)
+    task = RenderTask(
+        backend,
+        mesh,
+        source if isinstance(source, Camera) else None,
+        order,
+        optics,
+        content,
+        3 if content == "scalar" else parts[0].shape[1],
+        options.transmittance_threshold,
+        options.deterministic,
+        options.renderer,
+    )
+    if bundle is not None:
+        bundle = _in_unit(bundle, unit, backend)
+    return PreparedView(task, shape, vertices, _parts_by_unit(content, parts, unit), unit, bundle)
+
+
+def _checked(mesh: Any, field: Any, camera: Any, options: ViewOptions) -> ViewOptions:
+    """Refuse arguments of the wrong kind, those first that come in batches elsewhere."""
+    require_type(mesh, TetMesh, "mesh", "pass a difftetvr.TetMesh", DiffTetError)
+    require_type(field, (Field, ScalarField), "field", "pass one difftetvr.Field or ScalarField", DiffTetError)
+    if isinstance(camera, type) or not isinstance(camera, (Rays, RaySource)):
+        raise DiffTetError(f"camera is {shown(camera)}; {CAMERAS}.")
+    optics, renderer = options.optics, options.renderer
+    has_model = not isinstance(optics, type) and all(callable(getattr(optics, n, None)) for n in ("weights", "adjoint"))
+    if not (optics is None or has_model):
+        raise DiffTetError(f"optics is {shown(optics)}; pass a model, such as difftetvr.optics.ExactLinear().")
+    if not isinstance(renderer, str) or renderer not in RENDERERS:
+        raise DiffTetError(f"There is no renderer {shown(renderer)}; choose one of {', '.join(RENDERERS)}.")
+    if renderer == "projected" and not _is_plain(camera):
+        raise DiffTetError(
+            "The renderer 'projected' needs one order of cells for the whole view, and knows it for pinhole cameras "
+            "alone, whose intrinsics require no gradient; choose marching or linked-list."
+        )
+    require_type(options.deterministic, bool, "deterministic", "pass True or False", DiffTetError)
+    threshold = as_number(options.transmittance_threshold, "transmittance_threshold", DiffTetError)
+    if not 0.0 <= threshold < 1.0:
+        raise DiffTetError(f"transmittance_threshold is {threshold}; it must lie in [0, 1).")
+    return ViewOptions(optics, threshold, options.deterministic, renderer)
+
+
+def _is_plain(camera: RaySource | Rays) -> TypeGuard[Camera]:
+    """Whether it is a camera that can be rasterised, and whose rays need no gradients but by the pose."""
+    return type(camera) is Camera and camera.intrinsics is None
+
+
+def as_rays(camera: RaySource | Rays) -> Rays:
+    """The rays of a camera, or what are rays."""
+    return camera if isinstance(camera, Rays) else camera.rays()
+
+
+def _content(
+    mesh: TetMesh, field: Field | ScalarField, camera: Camera | Rays
+) -> tuple[Content, tuple[torch.Tensor, ...]]:
+    """What the volume holds, and its tensors as they are."""
+    location = field.location_on(mesh)
+    if isinstance(field, ScalarField):
+        if location == "vertex":
+            return "scalar", (field.normalised(), *field.knots(mesh.vertices))
+        field = field.as_field()
+    if field.harmonics is not None:
+        field.validate(mesh)
+        field = field.seen_from(mesh, camera.position if isinstance(camera, Camera) else _eye(camera, mesh))
+    return location, (field.color, field.density)
+
+
+def _eye(rays: Rays, mesh: TetMesh) -> torch.Tensor:
+    """(3,) the point that all rays start at, relative to the mesh's origin."""
+    origins = rays.relative_to(mesh.origin).origins.reshape(-1, 3)
+    if not bool((origins.detach() == origins[:1].detach()).all()):
+        raise DiffTetError(
+            "The field's colours depend on the direction (harmonics), and are known for rays that start at one point; "
+            "render each camera by itself, or pass a field without harmonics."
+        )
+    return origins.mean(0) if len(origins) else mesh.vertices.new_zeros(3)
+
+
+def _camera_space(mesh: TetMesh, camera: Camera) -> torch.Tensor:
+    """(V, 3) vertices in camera space, in float64 where float32 would blur what the camera sees.
+
+    A narrow view from far away sees differences of positions that are much smaller than their distance. Where only the
+    transform cancels, as for a mesh far from the origin that the camera is near to, its result is float32 again.
+    """
+    vertices = mesh.vertices
+    rounded = camera.to_camera_space(vertices)
+    if vertices.dtype != torch.float32 or vertices.device.type not in _KNOW_FLOAT64:
+        return rounded
+    seen = rounded.detach()
+    nearest, farthest = (float(z) for z in torch.aminmax(seen[:, 2]))
+    if nearest > _REMOTE * (farthest - nearest):
+        low, high = torch.aminmax(seen, dim=0)
+        if nearest > _REMOTE * float((high - low).max()):
+            return camera.to_camera_space(vertices.double())
+    shift = float(camera.world_to_camera.detach()[:3, 3].abs().max())
+    if shift > _REMOTE * max(abs(nearest), abs(farthest)):
+        return camera.to_camera_space(vertices.double()).float()
+    return rounded
+
+
+def _unit_of_length(vertices: torch.Tensor, mesh: TetMesh) -> tuple[torch.Tensor, float]:
+    """Vertices in a unit in which float32 products of them neither vanish nor overflow, and that unit.
+
+    The unit is a power of two, so nothing is rounded, and 1 for all meshes of common sizes.
+    """
+    low, high = torch.aminmax(vertices.detach())
+    largest = max(-float(low), float(high))
+    if not math.isfinite(largest):
+        bad = torch.nonzero(~torch.isfinite(mesh.vertices.detach()).all(dim=1)).flatten().tolist()
+        where = f"Vertex {bad[0]} of the mesh" if bad else "A vertex, seen from the camera,"
+        raise MeshError(f"{where} is not finite; check what moved it.")
+    if largest == 0.0 or _SMALL < largest < 1.0 / _SMALL:
+        return vertices, 1.0
+    unit = 2.0 ** math.frexp(largest)[1]
+    return vertices / unit, unit
+
+
+def _in_unit(bundle: PreparedRays, unit: float, backend: Backend) -> PreparedRays:
+    """Rays whose origins are in the unit of kernels, at their precision."""
+    scale = bundle.lines.new_tensor([1.0 / unit] * 3 + [1.0] * 3)
+    lines = (bundle.lines if unit == 1.0 else bundle.lines * scale).to(backend.dtype)
+    return replace(bundle, lines=lines)
+
+
+def _parts_by_unit(content: Content, parts: tuple[torch.Tensor, ...], unit: float) -> tuple[torch.Tensor, ...]:
+    """The content with densities per unit of length."""
+    if unit == 1.0:
+        return parts
+    if content == "scalar":
+        return (*parts[:2], torch.cat((_by_unit(parts[2][:, :1], unit), parts[2][:, 1:]), dim=1))
+    return parts[0], _by_unit(parts[1], unit)
+
+
+def _by_unit(density: torch.Tensor, unit: float) -> torch.Tensor:
+    """Densities per unit of length; beyond what the precision holds they are as great as it allows, never infinite."""
+    return (density * unit).clamp(max=torch.finfo(density.dtype).max)

@@ -1,0 +1,183 @@
+"""Bundles of rays, each with an origin and a direction of its own."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+import torch
+
+from difftetvr.errors import CameraError, shown
+from difftetvr.inputs import as_reals, moved
+
+MOST_RAYS = 1 << 28
+"""With so many, four floats a ray stay within the kernels' 32-bit indices."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """A bundle of rays in world space, of any shape: images, fans, single rays.
+
+    Attributes:
+        origins: (..., 3) where they start; images are differentiable in them.
+        directions: (..., 3) where they go, of any length but 0; likewise. Shapes are broadcast against each other's.
+        near: (...) or a number, distance in world units from which on a ray is looked at; differentiable. Where it is
+            negative, it is looked at from behind its origin; -infinity and infinity make it a line.
+        far: (...) or a number, distance up to which it is, at least near; may be infinite; differentiable.
+
+    Raises:
+        CameraError: Shapes do not fit, a value is not finite, a direction is 0, or near is beyond far.
+    """
+
+    origins: torch.Tensor
+    directions: torch.Tensor
+    near: torch.Tensor | float = 0.0
+    far: torch.Tensor | float = math.inf
+
+    def __post_init__(self) -> None:
+        origins, directions = (
+            as_reals(getattr(self, name), f"The rays' {name}", CameraError, advice="pass a tensor of shape (..., 3)")
+            for name in ("origins", "directions")
+        )
+        near, far = (
+            as_reals(
+                getattr(self, name), f"The rays' {name}", CameraError, directions.dtype, "pass a number or tensor"
+            ).to(directions.device)
+            for name in ("near", "far")
+        )
+        for name, tensor in (("origins", origins), ("directions", directions)):
+            if tensor.shape[-1:] != (3,):
+                raise CameraError(f"The rays' {name} have shape {tuple(tensor.shape)}; pass (..., 3).")
+        if origins.device != directions.device:
+            raise CameraError(
+                f"The rays' origins are on '{origins.device}', their directions on '{directions.device}'; move one."
+            )
+        try:
+            origins, directions = torch.broadcast_tensors(origins, directions)
+            near, far = (torch.broadcast_to(end, origins.shape[:-1]) for end in (near, far))
+        except RuntimeError as reason:
+            shapes = ", ".join(str(tuple(tensor.shape)) for tensor in (origins, directions, near, far))
+            raise CameraError(
+                f"The rays' origins, directions, near and far have shapes {shapes}, which do not fit together; pass "
+                "(..., 3), (..., 3), (...) and (...)."
+            ) from reason
+        if math.prod(origins.shape[:-1]) > MOST_RAYS:
+            raise CameraError(
+                f"There are {math.prod(origins.shape[:-1]):,} rays; pass at most {MOST_RAYS:,} at a time."
+            )
+        for name, value in (("origins", origins), ("directions", directions), ("near", near), ("far", far)):
+            object.__setattr__(self, name, value)
+        self._require_sound()
+
+    def _require_sound(self) -> None:
+        o, d, near, far = (tensor.detach() for tensor in (self.origins, self.directions, self.ends[0], self.ends[1]))
+        length = d.abs().amax(-1)
+        bad = ~(torch.isfinite(o).all(-1) & torch.isfinite(length) & (length > 0) & (near <= far))
+        if not bool(bad.any()):
+            return
+        place = tuple(torch.nonzero(bad)[0].tolist())
+        where = f"Ray {place[0] if len(place) == 1 else place}"
+        if not bool(torch.isfinite(o[place]).all()):
+            raise CameraError(f"{where} has the origin {shown(o[place].tolist())}; origins must be finite.")
+        if not bool(torch.isfinite(length[place]) & (length[place] > 0)):
+            raise CameraError(
+                f"{where} has the direction {shown(d[place].tolist())}; directions must be finite and not 0."
+            )
+        raise CameraError(
+            f"{where} is looked at from {float(near[place])} to {float(far[place])}; near must not be beyond far."
+        )
+
+    @property
+    def ends(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """``near`` and ``far`` as (...) tensors."""
+        near, far = self.near, self.far
+        assert isinstance(near, torch.Tensor) and isinstance(far, torch.Tensor)
+        return near, far
+
+    @property
+    def shape(self) -> torch.Size:
+        """Shape of the bundle, without the last dimension of its vectors."""
+        return self.directions.shape[:-1]
+
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Rays:
+        """The same rays on another device or in another precision; autograd sees them as a function of these.
+
+        Raises:
+            CameraError: This machine has no such device.
+        """
+        tensors = (self.origins, self.directions, *self.ends)
+        return Rays(*(moved(tensor, device, dtype, CameraError) for tensor in tensors))
+
+    def at(self, distances: torch.Tensor | float) -> torch.Tensor:
+        """(..., 3) points at distances along the rays; differentiable.
+
+        Args:
+            distances: (...) or a number, in world units.
+        """
+        along = as_reals(distances, "The distances", CameraError, self.directions.dtype).to(self.directions)
+        return self.origins + along[..., None] * torch.nn.functional.normalize(self.directions, dim=-1)
+
+    def relative_to(self, origin: Sequence[float]) -> Rays:
+        """The same rays in a world whose origin lies at a point of this one, (3,); in float64 unless it is the same."""
+        if not any(origin):
+            return self
+        shift = torch.tensor(list(origin), dtype=torch.float64, device=self.origins.device)
+        return replace(self, origins=self.origins.double() - shift)
+
+    @staticmethod
+    def stacked(bundles: Sequence[Rays]) -> Rays:
+        """Several bundles of one shape as one, (B, ...)."""
+        vectors = [(bundle.origins, bundle.directions, *bundle.ends) for bundle in bundles]
+        return Rays(*(torch.stack(part) for part in zip(*vectors, strict=True)))
+
+    @staticmethod
+    def joined(bundles: Sequence[Rays]) -> Rays:
+        """The rays of several bundles one after the other, (N,)."""
+        parts = [
+            (b.origins.reshape(-1, 3), b.directions.reshape(-1, 3), *(e.reshape(-1) for e in b.ends)) for b in bundles
+        ]
+        return Rays(*(torch.cat(part) for part in zip(*parts, strict=True)))
+
+
+@runtime_checkable
+class RaySource(Protocol):
+    """Anything that sees along rays: a camera of any kind."""
+
+    def rays(self) -> Rays:
+        """The rays in world space: (H, W), one for each pixel, or (B, H, W) of several views."""
+        ...
+
+
+@lru_cache(maxsize=64)
+def image_order(shape: tuple[int, ...]) -> np.ndarray | None:
+    """Numbers of rays in an order in which neighbours see neighbouring pixels, so that they share cells in cache.
+
+    Args:
+        shape: Shape of the bundle; the last two dimensions count as rows and columns of images.
+
+    Returns:
+        (N,) int32; None where the rays are no images.
+    """
+    from difftetvr.rendering.traversal.rays import lane_count, lane_pixel  # late: rays are there without kernels
+
+    if len(shape) < 2 or min(shape[-2:]) < _LEAST_SIDE:
+        return None
+    height, width = shape[-2:]
+    size: Any = _Size(np.uint32(width), np.uint32(height))
+    column, row, valid = lane_pixel(size, np.arange(lane_count(width, height), dtype=np.uint32))
+    one = (row * np.uint32(width) + column)[valid].astype(np.int64)
+    images = np.arange(math.prod(shape[:-2]))[:, None] * (width * height)
+    return (images + one).reshape(-1).astype(np.int32)
+
+
+_LEAST_SIDE = 4
+
+
+@dataclass(frozen=True)
+class _Size:
+    width: np.uint32
+    height: np.uint32

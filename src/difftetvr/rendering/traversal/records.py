@@ -1,0 +1,77 @@
+"""Flat records of channels and one more value, as kernels and PyTorch see them (Dr.Jit).
+
+Radiance with optical depth, colours with density, and the derivatives by each have one layout: C channels, then the
+one value, then zeros up to a whole number of packets of four floats, so that one instruction moves a packet.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import torch
+
+from difftetvr.backend import Backend
+
+PACKET = 4
+
+
+def packets_of(values: int) -> int:
+    """Number of packets that hold some values."""
+    return -(-values // PACKET)
+
+
+@dataclass(frozen=True)
+class Records:
+    """The layout of records of ``channels`` values and one more."""
+
+    channels: int
+
+    @property
+    def width(self) -> int:
+        """Floats a record; one alone needs no packet."""
+        return PACKET * packets_of(self.channels + 1) if self.channels else 1
+
+    def gather(self, backend: Backend, array: Any, index: Any, active: Any = True) -> list[Any]:
+        """The channels of a record, and the value behind them."""
+        if not self.channels:
+            return [dr.gather(backend.Float, array, index, active)]
+        return gather_values(backend, array, index * packets_of(self.channels + 1), self.channels + 1, active)
+
+    def scatter(self, backend: Backend, array: Any, values: list[Any], index: Any, active: Any = True) -> None:
+        """Store a record."""
+        for part, place in self._parts(backend, values, index):
+            dr.scatter(array, part, place, active)
+
+    def scatter_add(
+        self, backend: Backend, array: Any, values: list[Any], index: Any, active: Any, mode: dr.ReduceMode
+    ) -> None:
+        """Add to a record."""
+        for part, place in self._parts(backend, values, index):
+            dr.scatter_add(array, part, place, active, mode=mode)
+
+    def _parts(self, backend: Backend, values: list[Any], index: Any) -> list[tuple[Any, Any]]:
+        if not self.channels:
+            return [(values[0], index)]
+        count = packets_of(self.channels + 1)
+        padded = values + [backend.Float(0)] * (PACKET * count - len(values))
+        return [(backend.Float4(*padded[PACKET * k : PACKET * (k + 1)]), index * count + k) for k in range(count)]
+
+    def pack(self, channels: torch.Tensor, last: torch.Tensor) -> torch.Tensor:
+        """(N, width) records from (N, C) channels and (N,) values."""
+        padding = channels.new_zeros((channels.shape[0], self.width - self.channels - 1))
+        return torch.cat([channels, last[:, None], padding], dim=1)
+
+    def unpack(self, records: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """(N, C) channels and (N,) values of (N, width) records."""
+        return records[:, : self.channels], records[:, self.channels]
+
+
+def gather_values(backend: Backend, array: Any, packet: Any, count: int, active: Any) -> list[Any]:
+    """Some values that begin at a packet."""
+    values: list[Any] = []
+    for k in range(packets_of(count)):
+        part = dr.gather(backend.Float4, array, packet + k, active)
+        values += [part[i] for i in range(PACKET)]
+    return values[:count]
