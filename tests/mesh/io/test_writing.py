@@ -263,3 +263,16 @@ def test_meshio_reads_what_is_written(tmp_path, suffix):
     assert np.array_equal(found.points, MESH.vertices) and np.array_equal(found.cells_dict["tetra"], MESH.tets)
     assert all(np.array_equal(found.point_data[name], data[name]) for name in data)
     assert all(np.array_equal(np.concatenate(found.cell_data[name]), groups[name]) for name in groups)
+
+
+@pytest.mark.parametrize("channels", [0, 1, 5])
+def test_fields_of_other_channels_are_no_colours_but_data(tmp_path: Path, channels: int) -> None:
+    mesh = dtv.TetMesh.grid((2, 2, 2))
+    field = dtv.Field(torch.rand(27, channels), torch.rand(27))
+    for suffix in (".vtu", ".npz", ".bintet"):
+        with pytest.raises(MeshError, match=f"the field has {channels} channels, where files hold three colours"):
+            dtv.save(tmp_path / f"model{suffix}", mesh, field)
+    if channels:
+        dtv.save(tmp_path / "data.vtu", mesh, point_data={"features": field.color, "extinction": field.density})
+        read = dtv.load_data(tmp_path / "data.vtu").point_data["features"]
+        assert torch.equal(torch.as_tensor(read).reshape(27, channels), field.color)

@@ -89,6 +89,11 @@ def save(
     location = None if field is None else field.location_on(mesh)
     arrays = {} if field is None else {name: _numbers(values) for name, values in field.arrays().items()}
     is_field = set(FIELD_ARRAYS) <= set(arrays)
+    if is_field and arrays["color"].shape[1:] != (3,):
+        raise MeshError(
+            f"{path}: the field has {arrays['color'].shape[1]} channels, where files hold three colours; pass its "
+            "tensors as point_data or cell_data instead, by names of your own."
+        )
     require_writable_format(path, with_field=is_field)
     kind = format_of(path)
     assert kind.write is not None
