@@ -34,7 +34,7 @@ def test_ambiguous_length_is_per_vertex_unless_said():
     ("color", "density", "message"),
     [
         (torch.rand(5), torch.rand(5), r"color has shape \(5,\)"),
-        (torch.rand(5, 4), torch.rand(5), r"color has shape \(5, 4\)"),
+        (torch.rand(5, 65), torch.rand(5), r"color has shape \(5, 65\)"),
         (torch.rand(5, 3), torch.rand(4), r"density has shape \(4,\)"),
         (torch.rand(5, 3), torch.rand(5, 1), r"density has shape \(5, 1\)"),
         (torch.rand(5, 3).bool(), torch.rand(5), "torch.bool"),

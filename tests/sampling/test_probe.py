@@ -9,20 +9,13 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sampling.meshes import bent_mesh
 from torch import Tensor
 
 from difftetvr import probe
 from difftetvr.errors import MeshError
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.rendering import Camera, render
-
-
-def bent_mesh(seed: int = 0, dtype: torch.dtype = torch.float64) -> TetMesh:
-    """A Delaunay mesh of random points without a third of its cells."""
-    generator = torch.Generator().manual_seed(seed)
-    mesh = TetMesh.delaunay(torch.rand(60, 3, generator=generator, dtype=torch.float64))
-    kept = torch.rand(mesh.num_cells, generator=generator) > 0.33
-    return TetMesh(mesh.vertices, mesh.tets[kept]).to(dtype=dtype)
 
 
 def brute_force(mesh: TetMesh, points: Tensor) -> tuple[Tensor, Tensor]:

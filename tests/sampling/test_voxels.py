@@ -9,7 +9,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from sampling.test_probe import bent_mesh
+from sampling.meshes import bent_mesh
 from torch import Tensor
 
 from difftetvr import probe, voxelise
