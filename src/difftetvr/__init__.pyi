@@ -41,6 +41,7 @@ from .rendering.cameras.panoramic import PanoramicCamera as PanoramicCamera
 from .rendering.cameras.parallel import ParallelCamera as ParallelCamera
 from .rendering.cameras.pinhole import Camera as Camera
 from .rendering.rays import Rays as Rays
+from .rendering.rays import RaySource as RaySource
 from .rendering.scalar_field import ScalarField as ScalarField
 from .sampling.isosurfaces import isosurface as isosurface
 from .sampling.probing import probe as probe
@@ -65,6 +66,7 @@ __all__ = [
     "PanoramicCamera",
     "ParallelCamera",
     "PhotoCapture",
+    "RaySource",
     "Rays",
     "RenderedImage",
     "ScalarField",

@@ -19,6 +19,7 @@ from .cameras.panoramic import PanoramicCamera as PanoramicCamera
 from .cameras.parallel import ParallelCamera as ParallelCamera
 from .cameras.pinhole import Camera as Camera
 from .rays import Rays as Rays
+from .rays import RaySource as RaySource
 from .scalar_field import ScalarField as ScalarField
 from .tracers.projected import OrderWarning as OrderWarning
 
@@ -29,6 +30,7 @@ __all__ = [
     "OrderWarning",
     "PanoramicCamera",
     "ParallelCamera",
+    "RaySource",
     "Rays",
     "RenderedImage",
     "ScalarField",

@@ -20,8 +20,6 @@ from difftetvr.rendering.rays import Rays, RaySource
 from difftetvr.rendering.scalar_field import ScalarField
 from difftetvr.rendering.traversal.records import Records
 
-Background = torch.Tensor | tuple[float, ...] | None
-
 
 @dataclass(frozen=True)
 class RenderedImage:
@@ -56,7 +54,7 @@ def render(
     mesh: TetMesh,
     field: Field | ScalarField,
     camera: RaySource | Rays,
-    background: Background = None,
+    background: torch.Tensor | tuple[float, ...] | None = None,
     renderer: str = "marching",
     optics: OpticalModel | None = None,
     transmittance_threshold: float = 0.0,
@@ -70,7 +68,7 @@ def render(
     mesh: TetMesh,
     field: Field | ScalarField,
     camera: Sequence[RaySource],
-    background: Background = None,
+    background: torch.Tensor | tuple[float, ...] | None = None,
     renderer: str = "marching",
     optics: OpticalModel | None = None,
     transmittance_threshold: float = 0.0,
@@ -84,7 +82,7 @@ def render(
     mesh: TetMesh,
     field: Field | ScalarField,
     camera: RaySource | Rays | Sequence[RaySource],
-    background: Background = None,
+    background: torch.Tensor | tuple[float, ...] | None = None,
     renderer: str = "marching",
     optics: OpticalModel | None = None,
     transmittance_threshold: float = 0.0,
@@ -164,7 +162,7 @@ def _render(
     mesh: TetMesh,
     field: Field | ScalarField,
     camera: RaySource | Rays,
-    background: Background,
+    background: torch.Tensor | tuple[float, ...] | None,
     options: ViewOptions,
     clip_plane: Sequence[float] | torch.Tensor | None,
 ) -> RenderedImage:

@@ -32,8 +32,9 @@ LENS_MODELS = tuple(_ORDERS)
 class LensCamera(Camera):
     """A camera whose lens distorts, of the models of OpenCV, COLMAP and nerfstudio.
 
-    A direction (x, y, z) of camera space has the undistorted coordinates u = (x / z, y / z); with a fisheye's
-    u = theta (x, y) / |(x, y)|, theta being its angle with the axis. With r2 = |u|^2 and
+    A direction (x, y, z) of camera space has the undistorted coordinates (u, v) = (x / z, y / z); with a fisheye's
+    (u, v) = theta (x, y) / rho, theta being its angle with the axis and rho the length of (x, y). With
+    r2 = u^2 + v^2 and
 
         g = (1 + k1 r2 + k2 r2^2 + k3 r2^3 + k4 r2^4) / (1 + d1 r2 + d2 r2^2 + d3 r2^3)
 
@@ -45,8 +46,8 @@ class LensCamera(Camera):
     The order of the coefficients is that of the model's own source: ``"opencv"`` has k1, k2, p1, p2, k3, then d1, d2,
     d3 (called k4, k5, k6 there), then s1 to s4, and 2, 4, 5, 8 or 12 of them; ``"fisheye"`` has 1, 2 or 4 of k1 to k4;
     ``"thin-prism-fisheye"`` has COLMAP's k1, k2, p1, p2, k3, k4, sx1 (s1), sy1 (s3). COLMAP's SIMPLE_RADIAL, RADIAL,
-    OPENCV and FULL_OPENCV are ``"opencv"``, its *_FISHEYE are the others. Sources: OpenCV's manual, modules calib3d and
-    fisheye; https://colmap.github.io/cameras.html.
+    OPENCV and FULL_OPENCV are ``"opencv"``, its models of fisheyes are the others. Sources: OpenCV's manual, modules
+    calib3d and fisheye; https://colmap.github.io/cameras.html.
 
     Attributes:
         model: One of `LENS_MODELS`.
