@@ -52,10 +52,13 @@ def test_values_are_those_of_brute_force() -> None:
     dtype=st.sampled_from([torch.float32, torch.float64]),
 )
 @settings(max_examples=25, deadline=None)
-def test_linear_fields_are_exact_everywhere_in_a_convex_mesh(seed: int, scale: float, dtype: torch.dtype) -> None:
+def test_linear_fields_are_exact_everywhere_in_a_mesh(seed: int, scale: float, dtype: torch.dtype) -> None:
     """On vertices, edges and faces, too."""
     generator = torch.Generator().manual_seed(seed)
-    mesh = TetMesh.delaunay(scale * torch.rand(30, 3, generator=generator, dtype=torch.float64)).to(dtype=dtype)
+    grid = TetMesh.grid((3, 3, 3), dtype=torch.float64)
+    # No slivers, whose weights rounding moves by what they are thin.
+    bent = grid.vertices + 0.1 * (torch.rand(grid.num_vertices, 3, generator=generator, dtype=torch.float64) - 0.5)
+    mesh = grid.with_vertices(scale * bent).to(dtype=dtype)
     corners = mesh.vertices[mesh.tets.long()]
     places = [corners[:, 0], corners[:, :2].mean(1), corners[:, :3].mean(1), corners.mean(1)]
     direction = torch.randn(3, generator=generator, dtype=torch.float64).to(dtype)

@@ -13,9 +13,7 @@ import torch
 
 from difftetvr.errors import CameraError, shown
 from difftetvr.inputs import as_reals, moved
-
-MOST_RAYS = 1 << 28
-"""With so many, four floats a ray stay within the kernels' 32-bit indices."""
+from difftetvr.rendering.cameras.checks import MOST_PIXELS
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,9 +63,9 @@ class Rays:
                 f"The rays' origins, directions, near and far have shapes {shapes}, which do not fit together; pass "
                 "(..., 3), (..., 3), (...) and (...)."
             ) from reason
-        if math.prod(origins.shape[:-1]) > MOST_RAYS:
+        if math.prod(origins.shape[:-1]) > MOST_PIXELS:
             raise CameraError(
-                f"There are {math.prod(origins.shape[:-1]):,} rays; pass at most {MOST_RAYS:,} at a time."
+                f"There are {math.prod(origins.shape[:-1]):,} rays; pass at most {MOST_PIXELS:,} at a time."
             )
         for name, value in (("origins", origins), ("directions", directions), ("near", near), ("far", far)):
             object.__setattr__(self, name, value)

@@ -14,7 +14,7 @@ from torch.autograd.function import once_differentiable
 
 from difftetvr.backend import Backend, backend_for
 from difftetvr.mesh import TetMesh
-from difftetvr.sampling.location import NOWHERE, CellReader
+from difftetvr.sampling.location import NOWHERE, CellReader, cross, dot
 
 
 class Interpolate(torch.autograd.Function):
@@ -31,20 +31,19 @@ class Interpolate(torch.autograd.Function):
         ctx.mesh = mesh
         ctx.save_for_backward(vertices, values, points, cells)
         backend, channels = backend_for(vertices), values.shape[1]
-        result = torch.empty((points.shape[0], channels), dtype=values.dtype, device=values.device)
         if not points.shape[0]:
-            return result
+            return values.new_empty((0, channels))
         with backend.exclusive():
             place = _Place.of(backend, mesh, vertices, points, cells)
             weights, _ = place.weights()
-            table, found = backend.floats(values), dr.empty(backend.Float, result.numel())
+            table, found = backend.floats(values), dr.empty(backend.Float, channels * points.shape[0])
             for channel in range(channels):
                 total = backend.Float(0)
                 for weight, vertex in zip(weights, place.tet, strict=True):
                     value = dr.gather(backend.Float, table, channels * vertex + channel, place.known)
                     total = dr.fma(weight, value, total)
                 dr.scatter(found, dr.select(place.known, total, 0.0), channels * place.lane + channel)
-            return backend.tensor(found, *result.shape)
+            return backend.tensor(found, points.shape[0], channels)
 
     @staticmethod
     @once_differentiable
@@ -72,7 +71,7 @@ class Interpolate(torch.autograd.Function):
                     corner_worth[k] = dr.fma(g, value, corner_worth[k])
                     if needs_values:
                         dr.scatter_add(of_values, g * weights[k], index, place.known)
-            slope = [_dot(corner_worth, [row[axis] for row in slopes]) for axis in range(3)]
+            slope = [dot(corner_worth, [row[axis] for row in slopes]) for axis in range(3)]
             for axis in range(3):
                 if needs_points:
                     dr.scatter(of_points, dr.select(place.known, slope[axis], 0.0), 3 * place.lane + axis)
@@ -106,20 +105,9 @@ class _Place:
         """Barycentric weights, and their gradients by the point."""
         weights, _ = self.reader.weights(self.corners, self.point)
         edges = [[x - y for x, y in zip(corner, self.corners[0], strict=True)] for corner in self.corners[1:]]
-        normals = [_cross(edges[1], edges[2]), _cross(edges[2], edges[0]), _cross(edges[0], edges[1])]
-        volume = _dot(edges[0], normals[0])
+        normals = [cross(edges[1], edges[2]), cross(edges[2], edges[0]), cross(edges[0], edges[1])]
+        volume = dot(edges[0], normals[0])
         inverse = dr.select(volume != 0, 1.0 / volume, 0.0)
         slopes = [[n * inverse for n in normal] for normal in normals]
         first = [-(slopes[0][axis] + slopes[1][axis] + slopes[2][axis]) for axis in range(3)]
         return weights, [first, *slopes]
-
-
-def _cross(a: list[Any], b: list[Any]) -> list[Any]:
-    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-
-
-def _dot(a: list[Any], b: list[Any]) -> Any:
-    total = a[0] * b[0]
-    for x, y in zip(a[1:], b[1:], strict=True):
-        total = dr.fma(x, y, total)
-    return total

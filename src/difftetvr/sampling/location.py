@@ -15,29 +15,19 @@ import torch
 
 from difftetvr.backend import Backend, backend_for
 from difftetvr.mesh import TetMesh
-from difftetvr.rendering.search.hierarchy import Hierarchy, SortedItems, curve_order
+from difftetvr.rendering.search.hierarchy import CELLS_OF_A_LEAF, Hierarchy, curve_order, sorted_cells
+from difftetvr.rendering.search.scene import Cells
 
 NOWHERE = -1
 """Stands for the cell of a point that no cell holds."""
 
 _TOLERANCE = 16.0  # roundings by which a weight may be negative for a point to count as inside
-_CELLS_OF_A_LEAF = 2
 _POINTS_OF_AN_ITEM = 256  # of a grid, about so many are looked at by a lane
 
 
 @dataclass(frozen=True)
-class CellReader:
-    """Reads cells and tells barycentric weights of points in them.
-
-    Attributes:
-        backend: Array types.
-        vertices: Flat (V, 3) positions.
-        tets: Flat (T, 4) cells.
-    """
-
-    backend: Backend
-    vertices: Any
-    tets: Any
+class CellReader(Cells):
+    """Reads cells and tells barycentric weights of points in them."""
 
     @staticmethod
     def of(backend: Backend, mesh: TetMesh, vertices: torch.Tensor) -> CellReader:
@@ -46,15 +36,14 @@ class CellReader:
 
     def corners(self, cell: Any, active: Any = True) -> tuple[Any, list[list[Any]]]:
         """The four vertices of a cell, and their positions."""
-        tet = dr.gather(self.backend.UInt4, self.tets, cell, active)
-        real = self.backend.Float
-        return tet, [[dr.gather(real, self.vertices, 3 * tet[k] + axis, active) for axis in range(3)] for k in range(4)]
+        tet = self.cell(cell, active)
+        return tet, [self.point(tet[k], active) for k in range(4)]
 
     def weights(self, corners: list[list[Any]], point: list[Any]) -> tuple[list[Any], Any]:
         """Barycentric weights of a point, and how much rounding may move them."""
         a, b, c, d = ([x - y for x, y in zip(corner, point, strict=True)] for corner in corners)
-        ab, cd = _cross(a, b), _cross(c, d)
-        volumes = [_dot(b, cd), -_dot(a, cd), _dot(d, ab), -_dot(c, ab)]
+        ab, cd = cross(a, b), cross(c, d)
+        volumes = [dot(b, cd), -dot(a, cd), dot(d, ab), -dot(c, ab)]
         total = volumes[0] + volumes[1] + volumes[2] + volumes[3]
         inverse = dr.select(total != 0, 1.0 / total, 0.0)
         size = _largest(a) * _largest(b) * (_largest(c) + _largest(d)) + _largest(c) * _largest(d) * (
@@ -62,12 +51,11 @@ class CellReader:
         )
         return [volume * inverse for volume in volumes], _TOLERANCE * dr.epsilon(size) * size * dr.abs(inverse)
 
-    def holds(self, cell: Any, point: list[Any], active: Any) -> Any:
-        """Whether a cell holds a point, but for rounding."""
-        _, corners = self.corners(cell, active)
+    def holds(self, corners: list[list[Any]], point: list[Any]) -> Any:
+        """Whether a cell with some corners holds a point, but for rounding."""
         weights, slack = self.weights(corners, point)
-        inside = active
-        for weight in weights:
+        inside = weights[0] >= -slack
+        for weight in weights[1:]:
             inside &= weight >= -slack
         return inside
 
@@ -88,18 +76,15 @@ def locate(mesh: TetMesh, vertices: torch.Tensor, points: torch.Tensor) -> torch
     if not count or not mesh.num_cells:
         return torch.full((count,), NOWHERE, dtype=torch.int32, device=vertices.device)
     with backend.exclusive():
-        cells = torch.arange(mesh.num_cells, device=mesh.tets.device)
-        sorted_items = mesh.topology.cached(
-            "hierarchy.cells", lambda: SortedItems.of(cells, mesh.tets, vertices.detach())
-        )
-        hierarchy = Hierarchy.over(backend, sorted_items, vertices.detach(), _CELLS_OF_A_LEAF)
+        hierarchy = Hierarchy.over(backend, sorted_cells(mesh, vertices), vertices.detach(), CELLS_OF_A_LEAF)
         order = curve_order(points)  # so that neighbouring lanes look at the same cells
         reader, flat = CellReader.of(backend, mesh, vertices), backend.floats(points[order])
         lane = dr.arange(uint, count)
         point = [dr.gather(backend.Float, flat, 3 * lane + axis) for axis in range(3)]
 
         def at_cell(cell: Any, active: Any, best: Any) -> Any:
-            return dr.select(reader.holds(cell, point, active) & (cell < best), cell, best)
+            _, corners = reader.corners(cell, active)
+            return dr.select(active & reader.holds(corners, point) & (cell < best), cell, best)
 
         best = dr.full(uint, 0xFFFFFFFF, count)
         best = hierarchy.meet_points((point[0], point[1], point[2]), 0.0, dr.mask_t(point[0])(True), at_cell, best)
@@ -174,12 +159,8 @@ def locate_lattice(mesh: TetMesh, vertices: torch.Tensor, lattice: Lattice) -> t
             x, y = column // height, column - (column // height) * height
             place = [x0 + x, y0 + y, z0 + z]
             point = [dr.fma(real(i), s, f) for i, s, f in zip(place, step, first, strict=True)]
-            weights, slack = reader.weights(corners, point)
-            inside = dr.mask_t(slack)(True)
-            for weight in weights:
-                inside &= weight >= -slack
             index = (place[0] * size[1] + place[1]) * size[2] + place[2]
-            dr.scatter_reduce(dr.ReduceOp.Min, owners, cell, index, inside)
+            dr.scatter_reduce(dr.ReduceOp.Min, owners, cell, index, reader.holds(corners, point))
             ends = z + 1 >= depth
             return dr.select(ends, column + 1, column), dr.select(ends, 0, z + 1)
 
@@ -205,12 +186,17 @@ def _boxes(
     return lows, highs
 
 
-def _cross(a: list[Any], b: list[Any]) -> list[Any]:
+def cross(a: list[Any], b: list[Any]) -> list[Any]:
+    """Cross product."""
     return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 
 
-def _dot(a: list[Any], b: list[Any]) -> Any:
-    return dr.fma(a[0], b[0], dr.fma(a[1], b[1], a[2] * b[2]))
+def dot(a: list[Any], b: list[Any]) -> Any:
+    """Dot product; explicit fma, so that every kernel rounds alike."""
+    total = a[-1] * b[-1]
+    for x, y in zip(reversed(a[:-1]), reversed(b[:-1]), strict=True):
+        total = dr.fma(x, y, total)
+    return total
 
 
 def _largest(a: list[Any]) -> Any:

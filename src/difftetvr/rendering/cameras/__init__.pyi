@@ -1,3 +1,4 @@
+from . import checks as checks
 from . import detector as detector
 from . import lens as lens
 from . import panoramic as panoramic

@@ -10,7 +10,7 @@ import torch
 
 from difftetvr.errors import CameraError, shown
 from difftetvr.inputs import as_reals
-from difftetvr.rendering.cameras.pinhole import Camera
+from difftetvr.rendering.cameras.checks import take_size
 
 if TYPE_CHECKING:
     from difftetvr.rendering.rays import Rays
@@ -47,9 +47,7 @@ class Detector:
     direction: torch.Tensor | None = None
 
     def __post_init__(self) -> None:
-        sizes = Camera(torch.eye(4), 1.0, 1.0, 0.0, 0.0, self.width, self.height)
-        for name in ("width", "height"):
-            object.__setattr__(self, name, getattr(sizes, name))
+        take_size(self)
         if (self.source is None) == (self.direction is None):
             raise CameraError("A detector needs either a source or a direction of its rays; pass one of them.")
         views = set()

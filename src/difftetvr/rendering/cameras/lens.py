@@ -10,7 +10,8 @@ import torch
 
 from difftetvr.errors import CameraError, shown
 from difftetvr.inputs import as_reals
-from difftetvr.rendering.cameras.pinhole import Camera
+from difftetvr.rendering.cameras.pinhole import Camera, through_plane
+from difftetvr.rendering.cameras.rigid import pencil
 
 if TYPE_CHECKING:
     from difftetvr.rendering.rays import Rays
@@ -83,13 +84,11 @@ class LensCamera(Camera):
         """The rays of all pixels in world space, (H, W); of pixels that the lens cannot have made nothing is seen."""
         from difftetvr.rendering.rays import Rays  # late: it needs cameras' errors, not cameras
 
-        pose = self.world_to_camera.double()
-        seen = self.ray_directions().to(pose.device)
+        seen = self.ray_directions()
         known = torch.isfinite(seen.detach()).all(-1)
         seen = torch.where(known[..., None], seen, seen.new_tensor([0.0, 0.0, 1.0]))
-        directions = (seen[..., None] * pose[:3, :3]).sum(-2)
-        origin = -(pose[:3, :3] * pose[:3, 3:]).sum(0)
-        return Rays(origin.expand(directions.shape), directions, 0.0, torch.where(known, math.inf, 0.0))
+        origins, directions = pencil(self.world_to_camera, seen)
+        return Rays(origins, directions, 0.0, torch.where(known, math.inf, 0.0).to(directions.device))
 
     def _undistorted(self, seen: torch.Tensor) -> torch.Tensor:
         """(H, W, 2) undistorted coordinates, by Newton's method; NaN where there are none."""
@@ -170,8 +169,7 @@ def _solved(jacobian: tuple[torch.Tensor, ...], residual: torch.Tensor) -> torch
 def _directions(points: torch.Tensor, is_fisheye: bool) -> torch.Tensor:
     """(..., 3) unit directions of undistorted coordinates."""
     if not is_fisheye:
-        directions = torch.cat([points, torch.ones_like(points[..., :1])], dim=-1)
-        return directions / directions.norm(dim=-1, keepdim=True)
+        return through_plane(points)
     squares = points.square().sum(-1, keepdim=True)
     # Near the axis the quotient is its series, so that it has a derivative there.
     is_near = squares < 1e-12

@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from difftetvr.rendering.cameras.checks import take_pose, take_size
 from difftetvr.rendering.cameras.pinhole import Camera, Vector
+from difftetvr.rendering.cameras.rigid import pencil
 
 if TYPE_CHECKING:
     from difftetvr.rendering.rays import Rays
@@ -35,9 +37,8 @@ class PanoramicCamera:
     height: int
 
     def __post_init__(self) -> None:
-        frame = Camera(self.world_to_camera, 1.0, 1.0, 0.0, 0.0, self.width, self.height)
-        for name in ("world_to_camera", "width", "height"):
-            object.__setattr__(self, name, getattr(frame, name))
+        take_size(self)
+        take_pose(self)
 
     @staticmethod
     def look_at(
@@ -51,14 +52,12 @@ class PanoramicCamera:
         """The rays of all pixels in world space, (H, W); differentiable in the pose."""
         from difftetvr.rendering.rays import Rays  # late: it needs cameras' errors, not cameras
 
-        pose = self.world_to_camera.double()
+        device = self.world_to_camera.device
         longitude, latitude = (
-            ((torch.arange(count, dtype=torch.float64, device=pose.device) + 0.5) / count - 0.5) * span
+            ((torch.arange(count, dtype=torch.float64, device=device) + 0.5) / count - 0.5) * span
             for count, span in ((self.width, 2.0 * math.pi), (self.height, math.pi))
         )
         rows, columns = torch.meshgrid(latitude, longitude, indexing="ij")
         across = torch.cos(rows)
         seen = torch.stack([torch.sin(columns) * across, torch.sin(rows), torch.cos(columns) * across], dim=-1)
-        directions = (seen[..., None] * pose[:3, :3]).sum(-2)
-        origin = -(pose[:3, :3] * pose[:3, 3:]).sum(0)
-        return Rays(origin.expand(directions.shape), directions)
+        return Rays(*pencil(self.world_to_camera, seen))

@@ -10,7 +10,8 @@ import torch
 
 from difftetvr.errors import CameraError, shown
 from difftetvr.inputs import as_reals
-from difftetvr.rendering.cameras.pinhole import Camera, Vector, number
+from difftetvr.rendering.cameras.checks import number, take_pose, take_size
+from difftetvr.rendering.cameras.pinhole import Camera, Vector
 
 if TYPE_CHECKING:
     from difftetvr.rendering.rays import Rays
@@ -38,9 +39,8 @@ class ParallelCamera:
     near: float = 0.0
 
     def __post_init__(self) -> None:
-        frame = Camera(self.world_to_camera, 1.0, 1.0, 0.0, 0.0, self.width, self.height)
-        for name in ("world_to_camera", "width", "height"):
-            object.__setattr__(self, name, getattr(frame, name))
+        take_size(self)
+        take_pose(self)
         size = as_reals(self.pixel_size, "The camera's pixel_size", CameraError, torch.float64, "pass a number")
         if size.numel() not in (1, 2) or not bool((torch.isfinite(size.detach()) & (size.detach() > 0)).all()):
             raise CameraError(f"The camera's pixel_size is {shown(self.pixel_size)}; give one or two positive numbers.")

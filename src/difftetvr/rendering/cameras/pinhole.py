@@ -10,18 +10,17 @@ from typing import TYPE_CHECKING
 import torch
 
 from difftetvr.errors import CameraError, shown
-from difftetvr.inputs import as_number, as_reals, as_whole
-from difftetvr.rendering.cameras.rigid import transformed
+from difftetvr.inputs import as_reals
+from difftetvr.rendering.cameras.checks import number, pixels, take_pose, take_size
+from difftetvr.rendering.cameras.rigid import pencil, transformed
 
 if TYPE_CHECKING:
     from difftetvr.backend import Backend
     from difftetvr.rendering.rays import Rays
     from difftetvr.rendering.traversal.rays import ImageRays
 
-_ORTHONORMALITY_TOLERANCE = 1e-3
 _FAR = 16.0  # distances of camera and target from the origin, in their distance from each other
 _LEAST_SINGLE, _MOST_SINGLE = 1e-30, 1e30  # distances that float32 holds with all digits, and sums of them
-_MOST_PIXELS = 1 << 28  # four floats a pixel stay within the kernels' 32-bit indices
 
 Vector = Sequence[float] | torch.Tensor
 
@@ -59,33 +58,14 @@ class Camera:
 
     def __post_init__(self) -> None:
         self._gather_intrinsics()
-        pose = as_reals(self.world_to_camera, "world_to_camera", CameraError)
-        object.__setattr__(self, "world_to_camera", pose)
-        if pose.shape != (4, 4):
-            raise CameraError(f"world_to_camera has shape {tuple(pose.shape)}; give a (4, 4) matrix.")
         for name in ("fx", "fy", "cx", "cy"):
             object.__setattr__(self, name, number(name, getattr(self, name)))
-        for name in ("width", "height"):
-            object.__setattr__(self, name, _size(name, getattr(self, name)))
         if not all(math.isfinite(v) for v in (self.fx, self.fy, self.cx, self.cy)):
             raise CameraError("A focal length or principal point is not finite; give finite pixel values.")
         if self.fx <= 0 or self.fy <= 0:
             raise CameraError(f"Focal lengths are ({self.fx}, {self.fy}) pixels; both must be greater than 0.")
-        if self.width * self.height > _MOST_PIXELS:
-            raise CameraError(
-                f"The image size is {self.width} x {self.height} pixels; take at most {_MOST_PIXELS:,} in all."
-            )
-        values = pose.detach().to("cpu", torch.float64)
-        if not bool(torch.isfinite(values).all()):
-            raise CameraError("world_to_camera holds a value that is not finite; give a rigid transform.")
-        rotation = values[:3, :3]
-        deviation = (rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max().item()
-        last_row = (values[3] - torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)).abs().max().item()
-        if max(deviation, last_row) > _ORTHONORMALITY_TOLERANCE or torch.linalg.det(rotation) < 0:
-            raise CameraError(
-                "world_to_camera is no rigid transform (rotation without scale or mirror, last row 0 0 0 1); "
-                "orthonormalise it first."
-            )
+        take_size(self)
+        take_pose(self)
 
     def _gather_intrinsics(self) -> None:
         names = ("fx", "fy", "cx", "cy")
@@ -128,7 +108,7 @@ class Camera:
         Raises:
             CameraError: The points coincide, ``up`` is parallel to the view, or a value is out of range.
         """
-        fov_y, width, height = number("fov_y", fov_y), _size("width", width), _size("height", height)
+        fov_y, width, height = number("fov_y", fov_y), pixels("width", width), pixels("height", height)
         if not 0.0 < fov_y < math.pi:
             raise CameraError(f"fov_y is {fov_y} radians; it must lie between 0 and pi.")
         vectors = {"eye": eye, "target": target, "up": up}
@@ -179,9 +159,7 @@ class Camera:
 
     def ray_directions(self) -> torch.Tensor:
         """(H, W, 3) unit directions of the pixels' rays in camera space, float64; differentiable in the intrinsics."""
-        points = self.plane_points()
-        directions = torch.cat([points, torch.ones_like(points[..., :1])], dim=-1)
-        return directions / directions.norm(dim=-1, keepdim=True)
+        return through_plane(self.plane_points())
 
     def plane_points(self) -> torch.Tensor:
         """(H, W, 2) where the pixels' centres lie in the plane at distance 1, float64; differentiable likewise."""
@@ -197,10 +175,7 @@ class Camera:
         """The rays of all pixels in world space, (H, W); differentiable in extrinsics and intrinsics."""
         from difftetvr.rendering.rays import Rays  # late: it needs cameras' errors, not cameras
 
-        pose = self.world_to_camera.double()
-        directions = (self.ray_directions().to(pose.device)[..., None] * pose[:3, :3]).sum(-2)
-        origin = -(pose[:3, :3] * pose[:3, 3:]).sum(0)
-        return Rays(origin.expand(directions.shape), directions)
+        return Rays(*pencil(self.world_to_camera, self.ray_directions()))
 
     def kernel_rays(self, backend: Backend) -> ImageRays:
         """The camera's rays for kernels of a back end."""
@@ -210,7 +185,7 @@ class Camera:
 
     def with_size(self, width: int, height: int) -> Camera:
         """The same view at another resolution."""
-        width, height = _size("width", width), _size("height", height)
+        width, height = pixels("width", width), pixels("height", height)
         sx, sy = width / self.width, height / self.height
         own = None if self.intrinsics is None else self.intrinsics * self.intrinsics.new_tensor([sx, sy, sx, sy])
         fx, fy, cx, cy = self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy
@@ -234,19 +209,7 @@ class Camera:
         return replace(self, world_to_camera=world_to_camera)
 
 
-def number(name: str, value: object) -> float:
-    """A camera's parameter as a number.
-
-    Raises:
-        CameraError: It is none.
-    """
-    return as_number(value, f"The camera's {name}", CameraError)
-
-
-def _size(name: str, value: object) -> int:
-    pixels = as_whole(value, f"The camera's {name}", CameraError, "give a whole number of pixels")
-    if pixels < 1:
-        raise CameraError(f"The camera's {name} is {shown(pixels)} pixels; it must be at least 1.")
-    if pixels > _MOST_PIXELS:
-        raise CameraError(f"The camera's {name} is {shown(pixels)} pixels; take at most {_MOST_PIXELS:,} in all.")
-    return pixels
+def through_plane(points: torch.Tensor) -> torch.Tensor:
+    """(..., 3) unit directions through (..., 2) points of the plane at distance 1; differentiable."""
+    directions = torch.cat([points, torch.ones_like(points[..., :1])], dim=-1)
+    return directions / directions.norm(dim=-1, keepdim=True)

@@ -52,6 +52,23 @@ def _rows_times(rows: torch.Tensor, matrix: torch.Tensor) -> torch.Tensor:
     return torch.addcmul(torch.addcmul(x * a, y, b), z, c)
 
 
+def pencil(pose: torch.Tensor, seen: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Rays from a camera in world space, float64; differentiable in both.
+
+    Args:
+        pose: (4, 4) world to camera.
+        seen: (..., 3) directions in camera space.
+
+    Returns:
+        (..., 3) origins, which are all one, and directions.
+    """
+    pose = pose.double()
+    # No matrix products, which torch.autocast would round.
+    directions = (seen.to(pose.device)[..., None] * pose[:3, :3]).sum(-2)
+    origin = -(pose[:3, :3] * pose[:3, 3:]).sum(0)
+    return origin.expand(directions.shape), directions
+
+
 def full_precision(like: torch.Tensor) -> AbstractContextManager[Any]:
     """Where ``autocast`` is off for the device of a tensor."""
     kind = like.device.type

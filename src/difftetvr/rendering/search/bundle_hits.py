@@ -10,14 +10,13 @@ import drjit as dr
 import torch
 
 from difftetvr.mesh import TetMesh
-from difftetvr.rendering.search.hierarchy import Hierarchy, SortedItems
+from difftetvr.rendering.search.hierarchy import CELLS_OF_A_LEAF, Hierarchy, SortedItems, sorted_cells
 from difftetvr.rendering.search.hits import Hit
 from difftetvr.rendering.search.scene import Scene, boundary_half_faces
 from difftetvr.rendering.search.starts import NEAR, StartSearch
 from difftetvr.rendering.traversal.walk import crossing_depth, find_exit, holds_ray
 
 _FACES_OF_A_LEAF = 1
-_CELLS_OF_A_LEAF = 2
 
 
 class BundleScene:
@@ -50,20 +49,14 @@ class BundleScene:
             half_faces = boundary_half_faces(self.mesh)
             return SortedItems.of(half_faces, self.mesh.topology.boundary_faces, self.vertices)
 
-        return self._hierarchy("hierarchy.boundary", build, _FACES_OF_A_LEAF)
+        items = self.mesh.topology.cached("hierarchy.boundary", build)
+        return Hierarchy.over(self.scene.backend, items, self.vertices, _FACES_OF_A_LEAF)
 
     @cached_property
     def cells(self) -> Hierarchy:
         """Over all cells."""
-
-        def build() -> SortedItems:
-            cells = torch.arange(self.mesh.num_cells, device=self.mesh.tets.device)
-            return SortedItems.of(cells, self.mesh.tets, self.vertices)
-
-        return self._hierarchy("hierarchy.cells", build, _CELLS_OF_A_LEAF)
-
-    def _hierarchy(self, key: str, build: Callable[[], SortedItems], leaf_items: int) -> Hierarchy:
-        return Hierarchy.over(self.scene.backend, self.mesh.topology.cached(key, build), self.vertices, leaf_items)
+        items = sorted_cells(self.mesh, self.vertices)
+        return Hierarchy.over(self.scene.backend, items, self.vertices, CELLS_OF_A_LEAF)
 
     def for_each_entry(self, visit: Callable[[Hit], None]) -> None:
         """Call ``visit`` for all boundary faces that rays may enter through between their limits."""

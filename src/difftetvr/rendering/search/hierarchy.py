@@ -16,8 +16,12 @@ import drjit as dr
 import torch
 
 from difftetvr.backend import Backend
+from difftetvr.mesh import TetMesh
 from difftetvr.mesh.arrays import chunks
 from difftetvr.rendering.traversal.rays import Frame, rounding_of
+
+CELLS_OF_A_LEAF = 2
+"""Searches among cells are slower with one or with four."""
 
 _CURVE_BITS = 20  # of each coordinate
 
@@ -39,6 +43,12 @@ class SortedItems:
         """Sort (N,) items with (N, K) corners by where their centres lie among (V, 3) vertices."""
         order = curve_order(_centers(vertices, corners))
         return SortedItems(items[order].to(torch.int32), corners[order].to(torch.int32))
+
+
+def sorted_cells(mesh: TetMesh, vertices: torch.Tensor) -> SortedItems:
+    """All cells of a mesh, sorted by where they are among (V, 3) vertices the first time."""
+    cells = torch.arange(mesh.num_cells, device=mesh.tets.device)
+    return mesh.topology.cached("hierarchy.cells", lambda: SortedItems.of(cells, mesh.tets, vertices.detach()))
 
 
 @dataclass

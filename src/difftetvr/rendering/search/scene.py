@@ -22,46 +22,53 @@ NONE = 0xFFFFFFFF
 """Stands for no half-face, no node of a list, no cell."""
 
 
-@dataclass
-class Scene:
-    """The cells of a mesh, and the rays that may cross them.
+@dataclass(frozen=True)
+class Cells:
+    """The cells of a mesh.
 
     Attributes:
         backend: Array types.
-        rays: The rays.
-        vertices: Flat (V, 3) positions, in the space of the rays.
+        vertices: Flat (V, 3) positions.
         tets: Flat (T, 4) cells.
-        cell_count: T.
     """
 
     backend: Backend
-    rays: KernelRays
     vertices: Any
     tets: Any
-    cell_count: int
+
+    def point(self, vertex: Any, mask: Any = True) -> list[Any]:
+        """Position of a vertex."""
+        return [dr.gather(self.backend.Float, self.vertices, 3 * vertex + axis, mask) for axis in range(3)]
+
+    def cell(self, cell: Any, mask: Any = True) -> Any:
+        """The four vertices of a cell."""
+        return dr.gather(self.backend.UInt4, self.tets, cell, mask)
+
+
+@dataclass(frozen=True)
+class Scene(Cells):
+    """The cells of a mesh in the space of some rays that may cross them.
+
+    Attributes:
+        rays: The rays.
+    """
+
+    rays: KernelRays
 
     @staticmethod
     def of(backend: Backend, rays: KernelRays, mesh: TetMesh, vertices: torch.Tensor) -> Scene:
         """Upload a mesh with (V, 3) vertices in the space of the rays."""
-        return Scene(backend, rays, backend.floats(vertices), backend.uints(mesh.tets), mesh.num_cells)
+        return Scene(backend, backend.floats(vertices), backend.uints(mesh.tets), rays)
 
     @property
     def image(self) -> ImageRays:
         """The rays, where they are a camera's."""
         return cast("ImageRays", self.rays)
 
-    def point(self, vertex: Any, mask: Any = True) -> list[Any]:
-        """Position of a vertex."""
-        return [dr.gather(self.backend.Float, self.vertices, 3 * vertex + axis, mask) for axis in range(3)]
-
     def corner(self, frame: Frame, vertex: Any, mask: Any = True) -> Corner:
         """A vertex as a ray sees it."""
         a, b, t = frame.project(*self.point(vertex, mask))
         return Corner(vertex, a, b, [t], [])
-
-    def cell(self, cell: Any, mask: Any = True) -> Any:
-        """The four vertices of a cell."""
-        return dr.gather(self.backend.UInt4, self.tets, cell, mask)
 
     def indices_and_apex(self, half_face: Any, mask: Any = True) -> list[Any]:
         """The three vertices of a half-face, counter-clockwise for a ray that enters, and its cell's fourth."""
