@@ -23,10 +23,11 @@ GROUND = {
 
 ALLOWED = {
     "backend": GROUND,
+    "recording": GROUND | {"backend"},
     "terminal": GROUND,
     "mesh": GROUND,
     "optics": GROUND | {"backend"},
-    "rendering": GROUND | {"backend", "mesh", "optics"},
+    "rendering": GROUND | {"backend", "recording", "mesh", "optics"},
     "sampling": GROUND | {"backend", "mesh", "rendering"},
     "capture": GROUND | {"backend", "mesh", "optics", "rendering"},
     "fitting": GROUND | {"backend", "terminal", "mesh", "optics", "rendering", "capture"},
@@ -37,7 +38,7 @@ ALLOWED = {
 `view` and `fitting` are one storey; of the two, the one that shows results may know what a result is, never the other.
 """
 
-MAY_TOUCH_DRJIT = {"backend", "optics", "rendering", "sampling", "capture"}
+MAY_TOUCH_DRJIT = {"backend", "recording", "optics", "rendering", "sampling", "capture"}
 """Parts that hold kernels, or torch functions around them."""
 
 

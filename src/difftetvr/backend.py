@@ -16,7 +16,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any, ParamSpec, TypeVar
 
 import torch
@@ -43,7 +43,7 @@ class BackendWarning(UserWarning):
     """Something runs slower, or repeats less exactly, than this machine or the caller would have it."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Backend:
     """The Dr.Jit array types of one back end at one floating-point precision.
 
@@ -96,6 +96,10 @@ class Backend:
     def opaque_uint(self, value: int) -> Any:
         """An integer as a device value, so that kernels need no recompilation when it changes."""
         return dr.opaque(self.UInt, int(value))
+
+    def lanes(self, count: int) -> Any:
+        """The numbers 0 to ``count`` - 1, in memory: of kernels that read them Dr.Jit knows the size."""
+        return _lanes(self.UInt, count)
 
     def run(self, *arrays: Any) -> None:
         """Compute arrays and wait for them.
@@ -156,6 +160,13 @@ class Backend:
             if stream != torch.cuda.default_stream(self.device):
                 stream.synchronize()
         return flat
+
+
+@lru_cache(maxsize=32)
+def _lanes(uint: Any, count: int) -> Any:
+    numbers = dr.arange(uint, count)
+    dr.make_opaque(numbers)
+    return numbers
 
 
 def eager(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:

@@ -172,7 +172,9 @@ def _render(
     if 0 in view.shape:
         light, distance = (view.vertices[:0, :1].expand(0, n) for n in (Records(view.task.channels).width, 1))
         return compose(view, light, distance[:, 0], behind, mesh.vertices.dtype)
-    light, distance = RenderFunction.apply(view.task, view.vertices, limits, view.lines, *view.parts)
+    with view.task.backend.exclusive():
+        tracer = view.tracer(limits)
+    light, distance = RenderFunction.apply(view.task, tracer, view.vertices, view.pose, limits, view.lines, *view.parts)
     return compose(view, light, distance, behind, mesh.vertices.dtype)
 
 

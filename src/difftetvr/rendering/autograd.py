@@ -12,17 +12,21 @@ from torch.autograd.function import once_differentiable
 from difftetvr.backend import Backend
 from difftetvr.mesh import TetMesh
 from difftetvr.optics import OpticalModel
+from difftetvr.recording import few_lengths, replayed
 from difftetvr.rendering.cameras.pinhole import Camera
-from difftetvr.rendering.kernels.adjoint import ImageAdjoint, Wanted, render_adjoint
+from difftetvr.rendering.kernels.adjoint import Gradients, ImageAdjoint, Wanted, render_adjoint
 from difftetvr.rendering.kernels.forward import render_forward
+from difftetvr.rendering.kernels.layout import CellSource, GradientSource, VertexSource, collect
+from difftetvr.rendering.search.memory_order import MemoryOrder, OrderedMesh
+from difftetvr.rendering.tracers.aim import Aim
 from difftetvr.rendering.tracers.linked_list import LinkedList
 from difftetvr.rendering.tracers.marching import Marching
 from difftetvr.rendering.tracers.projected import Projected
 from difftetvr.rendering.traversal.bundle import BundleRays
-from difftetvr.rendering.traversal.crossing import Tracer, View, vertex_records
+from difftetvr.rendering.traversal.crossing import Tracer, View
 from difftetvr.rendering.traversal.rays import KernelRays
-from difftetvr.rendering.traversal.records import Records
 from difftetvr.rendering.traversal.transfer import Transfer
+from difftetvr.rendering.upload import LaidOut, Upload
 
 Content = Literal["vertex", "cell", "scalar"]
 """What a volume holds: (V, C) channels and (V,) densities on vertices, (T, C) and (T,) on cells, or (V,) scalars, (K,)
@@ -60,106 +64,152 @@ class RenderTask:
     deterministic: bool
     renderer: str = "marching"
 
-    def tracer(
-        self,
-        vertices: torch.Tensor,
-        limits: torch.Tensor | None,
-        lines: torch.Tensor | None,
-        parts: Sequence[torch.Tensor],
-    ) -> Tracer:
-        """Upload a view.
+    def upload(self, vertices: torch.Tensor, pose: torch.Tensor | None, parts: Sequence[torch.Tensor]) -> Upload:
+        """What kernels are sent of a view.
 
         Args:
-            vertices: (V, 3) in camera space, or that of the rays.
-            limits: (N, 2) distances between which each ray is looked at; None for all in front of its origin.
-            lines: (N, 6) origins and unit directions of a bundle of rays; None for those of the camera.
+            vertices: (V, 3) in the space of the rays, or that of the mesh.
+            pose: (4, 4) transform from the one to the other; None for the first.
             parts: What the volume holds, see :data:`Content`.
         """
-        backend = self.backend
-        cells = transfer = None
-        if self.content == "vertex":
-            color, density = (backend.floats(part) for part in parts)
-            records = vertex_records(backend, backend.floats(vertices), density, color, self.channels)
-        elif self.content == "cell":
-            color, density = parts
-            records = _with_fourth(backend, vertices, vertices.new_zeros(vertices.shape[0]))
-            cells = backend.floats(Records(self.channels).pack(color, density))
-        else:
-            scalar, knots, values = parts
-            records = _with_fourth(backend, vertices, scalar)
-            transfer = Transfer.of(backend, knots, values)
-        view = View(
+        backend, order = self.backend, MemoryOrder.of(self.mesh)
+        tables, is_vertex = order.tables(backend), self.content == "vertex"
+        first, second = (None if part is None or not part.numel() else backend.floats(part) for part in parts[:2])
+        cells = None
+        if self.content == "cell":
+            cells = CellSource(backend, tables.cells, second, first, self.channels)
+        source = VertexSource(
             backend,
-            self._rays(lines),
-            self.optics,
-            self.channels,
-            records,
-            cells,
-            transfer,
-            backend.opaque(self.threshold),
-            None if limits is None else backend.floats(limits),
+            tables.vertices,
+            backend.floats(vertices),
+            None if pose is None else backend.floats(pose),
+            {"vertex": second, "cell": None, "scalar": first}[self.content],
+            is_vertex,
+            first if is_vertex else None,
+            self.channels if is_vertex else 0,
         )
-        tracer: Tracer = TRACERS[self.renderer].of(view, self.mesh, vertices)
-        return tracer
+        return Upload(self.mesh, order, tables, source, cells)
 
-    def _rays(self, lines: torch.Tensor | None) -> KernelRays:
+    def rays(self, lines: torch.Tensor | None) -> KernelRays:
+        """The rays: a bundle of (N, 6) origins and unit directions, or those of the camera."""
         if lines is not None:
             return BundleRays.of(self.backend, lines, self.order)
         assert self.camera is not None
         return self.camera.kernel_rays(self.backend)
 
+    def tracer(
+        self, upload: Upload, laid_out: LaidOut, limits: torch.Tensor | None, rays: KernelRays, parts: Any
+    ) -> Tracer:
+        """What crosses a mesh that is laid out.
 
-def _with_fourth(backend: Backend, vertices: torch.Tensor, values: torch.Tensor) -> Any:
-    """Flat (V, 4) records of positions and one value each."""
-    return backend.floats(torch.cat([vertices, values[:, None]], dim=1))
+        Args:
+            upload: The mesh.
+            laid_out: The same, in memory.
+            limits: (N, 2) distances between which each ray is looked at; None for all in front of its origin.
+            rays: The rays.
+            parts: What the volume holds, see :data:`Content`.
+        """
+        backend = self.backend
+        view = View(
+            backend,
+            rays,
+            self.optics,
+            self.channels,
+            laid_out.records,
+            laid_out.cells,
+            Transfer.of(backend, parts[1], parts[2]) if self.content == "scalar" else None,
+            backend.opaque(self.threshold),
+            None if limits is None else backend.floats(limits),
+            backend.lanes(rays.lane_count),
+        )
+        positions = laid_out.positions(upload.vertices.stride, self.mesh.num_vertices)
+        ordered = OrderedMesh(upload.order, upload.tables, positions, laid_out.device_extent)
+        scene = upload.scene(laid_out.records, rays)
+        tracer: Tracer = TRACERS[self.renderer].of(Aim(view, scene, ordered, self.mesh, laid_out.entries))
+        return tracer
 
 
 class RenderFunction(torch.autograd.Function):
-    """From vertices, limits, rays and content to (N, width) records of channels and optical depth, (N,) distance.
+    """From vertices, pose, limits, rays and content to records of channels and optical depth, and distance.
 
-    The inputs are those of :meth:`RenderTask.tracer`.
+    The outputs are (N, width) and (N,). The inputs that may require gradients are what the tracer was made of.
     """
 
     @staticmethod
-    def forward(ctx: Any, task: RenderTask, vertices: Any, limits: Any, lines: Any, *parts: Any) -> Any:
-        """Render; keeps only the image and, while gradients are wanted, the uploaded view."""
+    def forward(
+        ctx: Any, task: RenderTask, tracer: Tracer, vertices: Any, pose: Any, limits: Any, lines: Any, *parts: Any
+    ) -> Any:
+        """Render; keeps only the image and, while gradients are wanted, the tracer."""
         with task.backend.exclusive():
-            tracer = task.tracer(vertices, limits, lines, parts)
             light, distance = render_forward(tracer)
             image = task.backend.tensor(light, -1, tracer.view.records.width), task.backend.tensor(distance)
         ctx.set_materialize_grads(False)
         ctx.task, ctx.tracer = task, tracer
-        ctx.vertex_count, ctx.part_size = vertices.shape[0], parts[0].shape[0]
-        ctx.save_for_backward(*image)
+        ctx.save_for_backward(*image, vertices if ctx.needs_input_grad[3] else None, pose)
         return image
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, g_light: Any, g_distance: Any) -> Any:
         """Go through the crossings again with the image's derivatives."""
-        backend = ctx.task.backend
-        light, distance = ctx.saved_tensors
-        wanted = Wanted(*ctx.needs_input_grad[1:4])
-        with backend.exclusive(one_thread=ctx.task.deterministic):
+        task, backend, tracer = ctx.task, ctx.task.backend, ctx.tracer
+        light, distance, vertices, pose = ctx.saved_tensors
+        needs_vertices, needs_pose, needs_limits, needs_lines = ctx.needs_input_grad[2:6]
+        wanted = Wanted(needs_vertices or needs_pose, needs_limits, needs_lines)
+        with backend.exclusive(one_thread=task.deterministic):
             image = ImageAdjoint(
                 backend.floats(torch.zeros_like(light) if g_light is None else g_light),
                 None if g_distance is None else backend.floats(g_distance),
                 backend.floats(light),
                 backend.floats(distance),
             )
-            gradients = render_adjoint(ctx.tracer, image, ctx.vertex_count, wanted)
-            vertices = (
-                backend.tensor(gradients.vertices).reshape(-1, 4)[: ctx.vertex_count, :3] if wanted.vertices else None
-            )
+            gradients = render_adjoint(tracer, image, task.mesh.num_vertices, wanted)
+            positions, channels, values = _collected(task, gradients, pose)
+            by_pose = _by_pose(task, gradients, vertices) if needs_pose else None
             limits = backend.tensor(gradients.limits, -1, 2) if wanted.limits else None
             lines = backend.tensor(gradients.lines, -1, 6) if wanted.lines else None
-            field = backend.tensor(gradients.field)
-            parts: tuple[torch.Tensor, ...]
-            if gradients.transfer is None:
-                records = ctx.tracer.view.records
-                parts = records.unpack(field.reshape(-1, records.width)[: ctx.part_size])
-            else:
-                values = backend.tensor(gradients.transfer.values).reshape(-1, 4)
-                parts = field[: ctx.part_size], backend.tensor(gradients.transfer.knots), values
-        asked = (part if needed else None for part, needed in zip(parts, ctx.needs_input_grad[4:], strict=True))
-        return None, vertices, limits, lines, *asked
+            parts = [channels, values]
+            if gradients.transfer is not None:
+                table = backend.tensor(gradients.transfer.values).reshape(-1, 4)
+                parts = [values, backend.tensor(gradients.transfer.knots), table]
+        asked = (part if needed else None for part, needed in zip(parts, ctx.needs_input_grad[6:], strict=True))
+        return None, None, positions if needs_vertices else None, by_pose, limits, lines, *asked
+
+
+def _collected(task: RenderTask, gradients: Gradients, pose: torch.Tensor | None) -> tuple[Any, Any, Any]:
+    """Gradients in the caller's order: (V, 3) by positions, None if not wanted, (M, C) by channels, (M,) by values."""
+    backend, tables = task.backend, MemoryOrder.of(task.mesh).tables(task.backend)
+    transform = None if pose is None else backend.floats(pose)
+    channels = 0 if task.content == "scalar" else task.channels
+    vertices, cells = task.mesh.num_vertices, task.mesh.num_cells
+    if task.content == "cell":
+        positions, _, _ = _collect(
+            GradientSource(backend, tables.vertices, gradients.vertices, transform, None, 0), vertices
+        )
+        source, count = GradientSource(backend, tables.cells, None, None, gradients.field, channels), cells
+        _, by_channel, by_value = _collect(source, count)
+    else:
+        source = GradientSource(backend, tables.vertices, gradients.vertices, transform, gradients.field, channels)
+        positions, by_channel, by_value = _collect(source, vertices)
+        count = vertices
+    return (
+        None if positions is None else backend.tensor(positions, -1, 3)[:vertices],
+        backend.tensor(by_channel)[: count * channels].reshape(count, channels),
+        backend.tensor(by_value)[:count],
+    )
+
+
+def _collect(source: GradientSource, count: int) -> tuple[Any, Any, Any]:
+    if source.vectors is None and source.records is None:
+        return None, None, None
+    gradients: tuple[Any, Any, Any] = replayed(collect, source, few_lengths(count))
+    return gradients
+
+
+def _by_pose(task: RenderTask, gradients: Gradients, vertices: torch.Tensor) -> torch.Tensor:
+    """(4, 4) gradient by the pose that (V, 3) vertices have been transformed by."""
+    order = MemoryOrder.of(task.mesh).vertices
+    seen = task.backend.tensor(gradients.vertices, -1, 4)[: order.shape[0], :3]
+    columns = vertices.index_select(0, order).unbind(1)
+    by_rotation = torch.stack([(seen * column[:, None]).sum(0) for column in columns], dim=1)
+    return torch.nn.functional.pad(torch.cat((by_rotation, seen.sum(0)[:, None]), 1), (0, 0, 0, 1))

@@ -193,7 +193,7 @@ def model_image(
     behind = as_background(background, mesh.vertices)
     backend = view.task.backend
     with backend.exclusive(one_thread=deterministic):
-        tracer = view.task.tracer(view.vertices, None, view.lines, view.parts)
+        tracer = view.tracer(None)
         light, distance = render_forward(tracer)
         gathered = backend.tensor(light, -1, tracer.view.records.width)
         image = compose(view, gathered, backend.tensor(distance), behind, view.vertices.dtype).color
@@ -201,12 +201,17 @@ def model_image(
         if valid is not None:
             residual = residual * valid.to(residual.device)[..., None]
         curvature = 2.0 / residual.numel()
-        records = hat_records(tracer, mesh, HatImage(backend.floats(image), backend.floats(curvature * residual)))
-        counts = (mesh.num_vertices, mesh.topology.edges.shape[0], mesh.topology.faces.shape[0])
-        vertices, edges, faces = (
-            _derivatives(backend.tensor(buffer).reshape(-1, RECORD)[:count], curvature).with_density_unit(view.unit)
-            for buffer, count in zip((records.vertices, records.edges, records.faces), counts, strict=True)
+        records = hat_records(
+            tracer, mesh, view.upload.order, HatImage(backend.floats(image), backend.floats(curvature * residual))
         )
+        counts = (mesh.num_vertices, mesh.topology.edges.shape[0], mesh.topology.faces.shape[0])
+        found = [
+            backend.tensor(buffer).reshape(-1, RECORD)[:count]
+            for buffer, count in zip((records.vertices, records.edges, records.faces), counts, strict=True)
+        ]
+    # Vertices were numbered in the order of memory.
+    found[0] = torch.empty_like(found[0]).index_copy_(0, view.upload.order.vertices.long(), found[0])
+    vertices, edges, faces = (_derivatives(rows, curvature).with_density_unit(view.unit) for rows in found)
     return ImageModel(vertices, edges, faces, float(residual.square().mean()))
 
 

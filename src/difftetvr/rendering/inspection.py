@@ -66,7 +66,7 @@ def inspect_rays(
     backend, rays = view.task.backend, math.prod(view.shape)
     limits = view.limits(clip_plane)
     with backend.exclusive():
-        tracer = view.task.tracer(view.vertices, limits, view.lines, view.parts)
+        tracer = view.tracer(limits)
         count, worst = dr.zeros(backend.Int, rays), dr.zeros(backend.Float, rays)
         tracer.trace(lambda rays: _InspectionKernel(tracer, rays, count, worst))
         counts, least = backend.tensor(count, *view.shape), backend.tensor(worst, *view.shape)

@@ -17,14 +17,18 @@ from difftetvr.optics import ConstantPerCell, ExactLinear, OpticalModel
 from difftetvr.rendering.autograd import TRACERS, Content, RenderTask
 from difftetvr.rendering.cameras.pinhole import Camera
 from difftetvr.rendering.clip_plane import clip_limits, clip_rays
+from difftetvr.rendering.kernels.layout import LARGEST
 from difftetvr.rendering.rays import Rays, RaySource, image_order
 from difftetvr.rendering.scalar_field import ScalarField
+from difftetvr.rendering.traversal.crossing import Tracer
+from difftetvr.rendering.traversal.rays import KernelRays
+from difftetvr.rendering.upload import Extent, LaidOut, Upload, lay_out, lay_out_for_camera
 
 RENDERERS = tuple(TRACERS)
 CAMERAS = "pass a difftetvr.Camera, a list of cameras, or difftetvr.Rays"
 _REMOTE = 64.0  # distances of sizes of the mesh from which float32 loses more than the tests allow it
 _KNOW_FLOAT64 = ("cpu", "cuda")
-_SMALL = 1e-6  # within this and its inverse, coordinates are left as they are
+_SMALL = 1 / LARGEST  # between these, coordinates are left as they are
 
 
 @dataclass(frozen=True)
@@ -44,18 +48,30 @@ class PreparedView:
     Attributes:
         task: What it needs besides tensors that may require gradients.
         shape: Of the image or bundle; N is the number of its rays.
-        vertices: (V, 3) in camera space or that of the rays, in a unit in which products neither vanish nor overflow.
+        vertices: (V, 3) in a unit in which products neither vanish nor overflow.
+        pose: (4, 4) transform from their space to that of the rays; None where these are the same.
         parts: What the volume holds, see :data:`difftetvr.rendering.autograd.Content`; densities are in that unit.
         unit: The unit, in world units.
         bundle: The rays, where they are not a camera's.
+        rays: The rays as kernels read them.
+        upload: What was sent to kernels.
+        laid_out: What they made of it.
     """
 
     task: RenderTask
     shape: tuple[int, ...]
     vertices: torch.Tensor
+    pose: torch.Tensor | None
     parts: tuple[torch.Tensor, ...]
     unit: float
     bundle: PreparedRays | None
+    rays: KernelRays
+    upload: Upload
+    laid_out: LaidOut
+
+    def tracer(self, limits: torch.Tensor | None) -> Tracer:
+        """What crosses the mesh along the rays, between (N, 2) limits; None for all in front of their origins."""
+        return self.task.tracer(self.upload, self.laid_out, limits, self.rays, self.parts)
 
     @property
     def lines(self) -> torch.Tensor | None:
@@ -149,35 +165,83 @@ def prepare_view(
             )
     order: torch.Tensor | None = None
     bundle: PreparedRays | None = None
-    shape: tuple[int, ...]
+    passed: _Passed
     if isinstance(source, Camera):
-        positions, shape = _camera_space(mesh, source), (source.height, source.width)
+        shape: tuple[int, ...] = (source.height, source.width)
+        passed = _Passed(mesh.vertices, source.world_to_camera.to(mesh.vertices), parts, 1.0)
     else:
-        positions, shape = mesh.vertices, tuple(source.shape)
+        shape = tuple(source.shape)
         places = image_order(shape)
-        order = None if places is None else torch.from_numpy(places).to(positions.device)
+        order = None if places is None else torch.from_numpy(places).to(mesh.vertices.device)
         bundle = PreparedRays.of(source, mesh)
-    backend = backend_for(positions)
-    parts = tuple(part.to(backend.dtype) for part in parts)
-    if content != "scalar":
-        Field(parts[0], parts[1], content).validate(mesh)
-    optics = options.optics or (ConstantPerCell() if content == "cell" else ExactLinear())
-    vertices, unit = _unit_of_length(positions, mesh)
+        passed = _Passed(mesh.vertices, None, parts, 1.0)
     task = RenderTask(
-        backend,
+        backend_for(mesh.vertices),
         mesh,
         source if isinstance(source, Camera) else None,
         order,
-        optics,
+        options.optics or (ConstantPerCell() if content == "cell" else ExactLinear()),
         content,
         3 if content == "scalar" else parts[0].shape[1],
         options.transmittance_threshold,
         options.deterministic,
         options.renderer,
     )
+    if task.renderer == "marching":
+        mesh.topology.cell_adjacency  # noqa: B018  refuses loose cells, which have none
+    view = _laid_out(task, shape, passed, bundle)
+    if _is_common(view):
+        return view
+    task, passed = _uncommon(task, passed)
+    return _laid_out(task, shape, passed, bundle)
+
+
+@dataclass(frozen=True)
+class _Passed:
+    """What is passed to kernels: see :class:`PreparedView`."""
+
+    vertices: torch.Tensor
+    pose: torch.Tensor | None
+    parts: tuple[torch.Tensor, ...]
+    unit: float
+
+
+def _laid_out(task: RenderTask, shape: tuple[int, ...], passed: _Passed, bundle: PreparedRays | None) -> PreparedView:
+    backend = task.backend
+    parts = tuple(part.to(backend.dtype) for part in passed.parts)
     if bundle is not None:
-        bundle = _in_unit(bundle, unit, backend)
-    return PreparedView(task, shape, vertices, _parts_by_unit(content, parts, unit), unit, bundle)
+        bundle = _in_unit(bundle, passed.unit, backend)
+    with backend.exclusive():
+        rays: Any = task.rays(None if bundle is None else bundle.lines)
+        upload = task.upload(passed.vertices, passed.pose, parts)
+        finds_entries = bundle is None and task.renderer == "marching"
+        laid_out = lay_out_for_camera(upload, rays) if finds_entries else lay_out(upload)
+    return PreparedView(task, shape, passed.vertices, passed.pose, parts, passed.unit, bundle, rays, upload, laid_out)
+
+
+def _is_common(view: PreparedView) -> bool:
+    """Whether a view can be rendered as it is: all is finite, neither huge nor tiny nor far away for its precision."""
+    extent, task = view.laid_out.extent, view.task
+    is_sized = extent.largest == 0.0 or _SMALL < extent.largest < LARGEST
+    if not (extent.is_sound and is_sized):
+        return False
+    return task.camera is None or not _is_blurred(extent, task.camera, view.vertices)
+
+
+def _uncommon(task: RenderTask, passed: _Passed) -> tuple[RenderTask, _Passed]:
+    """The same view in float64 or another unit, where that helps.
+
+    Raises:
+        MeshError: Nothing helps.
+    """
+    mesh = task.mesh
+    positions = mesh.vertices if task.camera is None else _camera_space(mesh, task.camera)
+    parts = tuple(part.to(positions.dtype) for part in passed.parts)
+    if task.content != "scalar":
+        Field(parts[0], parts[1], task.content).validate(mesh)
+    vertices, unit = _unit_of_length(positions, mesh)
+    task = replace(task, backend=backend_for(vertices))
+    return task, _Passed(vertices, None, _parts_by_unit(task.content, parts, unit), unit)
 
 
 def _checked(mesh: Any, field: Any, camera: Any, options: ViewOptions) -> ViewOptions:
@@ -248,18 +312,27 @@ def _camera_space(mesh: TetMesh, camera: Camera) -> torch.Tensor:
     """
     vertices = mesh.vertices
     rounded = camera.to_camera_space(vertices)
-    if vertices.dtype != torch.float32 or vertices.device.type not in _KNOW_FLOAT64:
+    low, high = torch.aminmax(rounded.detach(), dim=0)
+    extent = Extent(tuple(low.tolist()), tuple(high.tolist()), True)
+    if not _is_blurred(extent, camera, vertices):
         return rounded
-    seen = rounded.detach()
-    nearest, farthest = (float(z) for z in torch.aminmax(seen[:, 2]))
-    if nearest > _REMOTE * (farthest - nearest):
-        low, high = torch.aminmax(seen, dim=0)
-        if nearest > _REMOTE * float((high - low).max()):
-            return camera.to_camera_space(vertices.double())
+    exact = camera.to_camera_space(vertices.double())
+    return exact if _is_remote(extent) else exact.float()
+
+
+def _is_blurred(extent: Extent, camera: Camera, vertices: torch.Tensor) -> bool:
+    """Whether float32 does not resolve what a camera sees of vertices of some extent, and float64 is there."""
+    if vertices.dtype != torch.float32 or vertices.device.type not in _KNOW_FLOAT64:
+        return False
+    if _is_remote(extent):
+        return True
     shift = float(camera.world_to_camera.detach()[:3, 3].abs().max())
-    if shift > _REMOTE * max(abs(nearest), abs(farthest)):
-        return camera.to_camera_space(vertices.double()).float()
-    return rounded
+    return shift > _REMOTE * max(abs(extent.low[2]), abs(extent.high[2]))
+
+
+def _is_remote(extent: Extent) -> bool:
+    nearest, size = extent.low[2], max(high - low for low, high in zip(extent.low, extent.high, strict=True))
+    return nearest > _REMOTE * size
 
 
 def _unit_of_length(vertices: torch.Tensor, mesh: TetMesh) -> tuple[torch.Tensor, float]:
@@ -273,7 +346,7 @@ def _unit_of_length(vertices: torch.Tensor, mesh: TetMesh) -> tuple[torch.Tensor
         bad = torch.nonzero(~torch.isfinite(mesh.vertices.detach()).all(dim=1)).flatten().tolist()
         where = f"Vertex {bad[0]} of the mesh" if bad else "A vertex, seen from the camera,"
         raise MeshError(f"{where} is not finite; check what moved it.")
-    if largest == 0.0 or _SMALL < largest < 1.0 / _SMALL:
+    if largest == 0.0 or _SMALL < largest < LARGEST:
         return vertices, 1.0
     unit = 2.0 ** math.frexp(largest)[1]
     return vertices / unit, unit

@@ -76,7 +76,7 @@ def locate(mesh: TetMesh, vertices: torch.Tensor, points: torch.Tensor) -> torch
     if not count or not mesh.num_cells:
         return torch.full((count,), NOWHERE, dtype=torch.int32, device=vertices.device)
     with backend.exclusive():
-        hierarchy = Hierarchy.over(backend, sorted_cells(mesh, vertices), vertices.detach(), CELLS_OF_A_LEAF)
+        hierarchy = Hierarchy.over(backend, sorted_cells(mesh.topology, vertices), vertices.detach(), CELLS_OF_A_LEAF)
         order = curve_order(points)  # so that neighbouring lanes look at the same cells
         reader, flat = CellReader.of(backend, mesh, vertices), backend.floats(points[order])
         lane = dr.arange(uint, count)

@@ -16,6 +16,7 @@ from typing import Any
 
 import drjit as dr
 
+from difftetvr.recording import few_lengths, replayed
 from difftetvr.rendering.traversal.crossing import (
     Clip,
     Span,
@@ -101,12 +102,6 @@ class PixelAdjoint:
     distance: Any | None
 
 
-def buffer_length(count: int) -> int:
-    """A length of at least ``count`` out of few, four an octave: per-thread copies bake it into the kernel."""
-    step = 1 << max(0, count.bit_length() - 3)
-    return -(-count // step) * step
-
-
 def reduce_mode(view: View, floats: int) -> dr.ReduceMode:
     """On CPUs one gradient copy a thread beats atomics, as long as the copies fit a budget."""
     if view.backend.name != "llvm":
@@ -134,25 +129,42 @@ def render_adjoint(tracer: Tracer, image: ImageAdjoint, vertex_count: int, wante
         wanted: What else needs gradients.
     """
     view = tracer.view
-    real = view.backend.Float
     width = 1 if view.transfer is not None else view.records.width
-    field_count = buffer_length(vertex_count if view.cells is None else dr.width(view.cells) // width)
-    position_count = buffer_length(vertex_count) if wanted.vertices else 0
-    transfer = None
-    if view.transfer is not None:
-        transfer = TransferGradients(
-            *(dr.zeros(real, dr.width(a)) for a in (view.transfer.knots, view.transfer.values))
-        )
-    gradients = Gradients(
-        dr.zeros(real, width * field_count),
-        dr.zeros(real, 4 * position_count) if wanted.vertices else None,
-        dr.zeros(real, dr.width(view.limits)) if wanted.limits else None,
-        dr.zeros(real, 6 * view.rays.count) if wanted.lines else None,
-        transfer,
-        reduce_mode(view, width * field_count + 4 * position_count),
+    field_count = few_lengths(vertex_count if view.cells is None else dr.width(view.cells) // width)
+    transfer = view.transfer
+    sizes = BufferSizes(
+        width * field_count,
+        4 * few_lengths(vertex_count) if wanted.vertices else None,
+        2 * view.rays.count if wanted.limits else None,
+        6 * view.rays.count if wanted.lines else None,
+        None if transfer is None else (dr.width(transfer.knots), dr.width(transfer.values)),
     )
+    mode = reduce_mode(view, sizes.field + (sizes.vertices or 0))
+    gradients: Gradients = replayed(_adjoint, tracer, image, sizes, mode)
+    return gradients
+
+
+@dataclass(frozen=True)
+class BufferSizes:
+    """Floats in each of the buffers of :class:`Gradients`; None for those that are not wanted."""
+
+    field: int
+    vertices: int | None
+    limits: int | None
+    lines: int | None
+    transfer: tuple[int, int] | None
+
+
+def _adjoint(tracer: Tracer, image: ImageAdjoint, sizes: BufferSizes, mode: dr.ReduceMode) -> Gradients:
+    real = tracer.view.backend.Float
+    field, vertices, limits, lines = (
+        None if size is None else dr.zeros(real, size)
+        for size in (sizes.field, sizes.vertices, sizes.limits, sizes.lines)
+    )
+    transfer = None if sizes.transfer is None else TransferGradients(*(dr.zeros(real, size) for size in sizes.transfer))
+    gradients = Gradients(field, vertices, limits, lines, transfer, mode)
     tracer.trace(lambda rays: _AdjointKernel(tracer, rays, image, gradients))
-    view.backend.run(gradients.field, gradients.vertices, gradients.limits, gradients.lines, gradients.transfer)
+    dr.eval(field, vertices, limits, lines, transfer)
     return gradients
 
 

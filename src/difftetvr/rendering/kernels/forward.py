@@ -11,6 +11,7 @@ from typing import Any
 
 import drjit as dr
 
+from difftetvr.recording import replayed
 from difftetvr.rendering.traversal.crossing import (
     Span,
     Step,
@@ -48,11 +49,15 @@ def render_forward(tracer: Tracer) -> tuple[Any, Any]:
     Returns:
         Flat arrays: (N, width) records of premultiplied radiance and optical depth, (N,) integral of the distance.
     """
-    view = tracer.view
-    real, count = view.backend.Float, view.rays.count
-    light, distance = dr.empty(real, view.records.width * count), dr.empty(real, count)
+    light, distance = replayed(_forward, tracer, tracer.view.rays.count)
+    return light, distance
+
+
+def _forward(tracer: Tracer, count: int) -> tuple[Any, Any]:
+    real, width = tracer.view.backend.Float, tracer.view.records.width
+    light, distance = dr.empty(real, width * count), dr.empty(real, count)
     tracer.trace(lambda rays: _ForwardKernel(tracer, rays, light, distance))
-    view.backend.run(light, distance)
+    dr.eval(light, distance)
     return light, distance
 
 

@@ -24,8 +24,10 @@ import torch
 
 from difftetvr.mesh import TetMesh
 from difftetvr.mesh.topology.incidence import cell_edges, cell_faces
-from difftetvr.mesh.topology.topology import LOCAL_EDGE_OF, LOCAL_EDGES
-from difftetvr.rendering.kernels.adjoint import buffer_length, reduce_mode
+from difftetvr.mesh.topology.topology import LOCAL_EDGE_OF, LOCAL_EDGES, Topology
+from difftetvr.recording import few_lengths, replayed
+from difftetvr.rendering.kernels.adjoint import reduce_mode
+from difftetvr.rendering.search.memory_order import MemoryOrder
 from difftetvr.rendering.traversal.crossing import (
     Span,
     Step,
@@ -64,9 +66,9 @@ class HatTables:
     faces: Any
 
     @staticmethod
-    def of(view: View, mesh: TetMesh) -> HatTables:
-        """Upload the tables of a mesh; built once for a topology."""
-        edges, faces = mesh.topology.cached("render.hat_tables", lambda: _ranked_tables(mesh))
+    def of(view: View, mesh: TetMesh, order: MemoryOrder) -> HatTables:
+        """Upload the tables of a mesh in an order; built once for a topology."""
+        edges, faces = order.topology.cached("render.hat_tables", lambda: _ranked_tables(mesh.topology, order))
         return HatTables(view.backend.uints(edges), view.backend.uints(faces))
 
 
@@ -131,21 +133,27 @@ class _Samples:
         return total
 
 
-def hat_records(tracer: Tracer, mesh: TetMesh, image: HatImage) -> HatRecords:
+def hat_records(tracer: Tracer, mesh: TetMesh, order: MemoryOrder, image: HatImage) -> HatRecords:
     """Sums over the rays of a view for every vertex, edge and face.
 
     Args:
         tracer: The view, to be walked through; its field lives on vertices.
         mesh: The mesh that is seen.
+        order: Its order in memory, which is that of the records of vertices; edges and faces are in the mesh's.
         image: The rendered image, and the derivative of the loss with respect to it.
     """
     view, topology = tracer.view, mesh.topology
-    counts = [buffer_length(n) for n in (mesh.num_vertices, topology.edges.shape[0], topology.faces.shape[0])]
-    vertices, edges, faces = buffers = [dr.zeros(view.backend.Float, RECORD * count) for count in counts]
-    records = HatRecords(vertices, edges, faces, reduce_mode(view, RECORD * sum(counts)))
-    tables = HatTables.of(view, mesh)
+    counts = [few_lengths(n) for n in (mesh.num_vertices, topology.edges.shape[0], topology.faces.shape[0])]
+    mode = reduce_mode(view, RECORD * sum(counts))
+    records: HatRecords = replayed(_records, tracer, HatTables.of(view, mesh, order), image, counts, mode)
+    return records
+
+
+def _records(tracer: Tracer, tables: HatTables, image: HatImage, counts: list[int], mode: dr.ReduceMode) -> HatRecords:
+    vertices, edges, faces = (dr.zeros(tracer.view.backend.Float, RECORD * count) for count in counts)
+    records = HatRecords(vertices, edges, faces, mode)
     tracer.trace(lambda rays: _HatKernel(tracer, rays, tables, records, image))
-    view.backend.run(*buffers)
+    dr.eval(vertices, edges, faces)
     return records
 
 
@@ -327,9 +335,10 @@ def _pick(pick: Any, responses: list[Response]) -> Response:
     return [pick([response[i] for response in responses]) for i in range(4)]
 
 
-def _ranked_tables(mesh: TetMesh) -> tuple[torch.Tensor, torch.Tensor]:
-    order = mesh.tets.argsort(dim=1)
-    faces = torch.gather(cell_faces(mesh.topology), 1, order)
-    local = torch.tensor(LOCAL_EDGE_OF, device=order.device)
-    columns = torch.stack([local[order[:, i], order[:, j]] for i, j in LOCAL_EDGES], 1)
-    return torch.gather(cell_edges(mesh.topology), 1, columns).contiguous(), faces.contiguous()
+def _ranked_tables(topology: Topology, order: MemoryOrder) -> tuple[torch.Tensor, torch.Tensor]:
+    # Vertices of a cell are ranked by their numbers in memory; their places in the cell are the mesh's.
+    ranked = order.topology.tets.argsort(dim=1)
+    edges, faces = (table.index_select(0, order.cells) for table in (cell_edges(topology), cell_faces(topology)))
+    local = torch.tensor(LOCAL_EDGE_OF, device=ranked.device)
+    columns = torch.stack([local[ranked[:, i], ranked[:, j]] for i, j in LOCAL_EDGES], 1)
+    return torch.gather(edges, 1, columns).contiguous(), torch.gather(faces, 1, ranked).contiguous()

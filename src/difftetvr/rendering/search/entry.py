@@ -6,24 +6,15 @@ are looked for in a hierarchy. Where a ray starts inside the mesh, the cell that
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
-from typing import Any
+from typing import Any, Protocol
 
 import drjit as dr
-import torch
 
-from difftetvr.backend import Backend
-from difftetvr.mesh import TetMesh
-from difftetvr.rendering.search.bundle_hits import BundleScene
+from difftetvr.recording import few_lengths, replayed
 from difftetvr.rendering.search.hits import Hit
-from difftetvr.rendering.search.rasterise import for_each_hit, work_items
-from difftetvr.rendering.search.scene import Scene, boundary_half_faces
-from difftetvr.rendering.search.starts import cells_around_camera, for_each_start_at_camera
-from difftetvr.rendering.traversal.bundle import BundleRays
-
-Finder = Callable[[Callable[[Hit], None]], None]
+from difftetvr.rendering.search.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -45,73 +36,85 @@ class EntryLists:
     is_simple: bool
 
 
-def find_entries(scene: Scene, mesh: TetMesh, vertices: torch.Tensor, limits: Any | None) -> EntryLists:
-    """Entry lists of every ray of a view.
+class EntrySearch(Protocol):
+    """Finds where rays enter a mesh."""
 
-    Args:
-        scene: The cells and the rays.
-        mesh: Mesh, for its topology.
-        vertices: (V, 3) vertices in the space of the rays.
-        limits: (N, 2) distances between which each ray is looked at; None for all in front of it.
+    scene: Scene
+
+    def for_each(self, visit: Callable[[Hit], None], settle: Callable[[], Any]) -> None:
+        """Call ``visit`` for all half-faces that rays may enter through, ``settle`` after each kernel's worth."""
+        ...
+
+
+@dataclass
+class EntryCounts:
+    """How many entries there are.
+
+    Attributes:
+        count: (N,) those of each ray.
+        half_faces: (N,) one of them, which is all where no ray has more.
+        most: (1,) the greatest number.
+        total: (1,) the sum of the numbers.
     """
-    backend = scene.backend
-    if isinstance(scene.rays, BundleRays):
-        bundle = BundleScene(scene, mesh, vertices, limits)
-        finders = [bundle.for_each_start] if bundle.may_start_inside else []
-        has_starts = bundle.may_start_inside
-        finders.append(bundle.for_each_entry)
-    else:
-        around = cells_around_camera(backend, mesh, vertices)
-        has_starts = around is not None
-        finders = [] if around is None else [partial(for_each_start_at_camera, scene, mesh, around)]
-        finders.append(partial(for_each_hit, scene, work_items(scene, backend.uints(boundary_half_faces(mesh)))))
-    count, half_faces = _count(scene, finders)
-    is_simple = int(dr.max(count)[0]) <= 1
-    if is_simple:
-        offset = dr.arange(backend.UInt, scene.rays.count)
-    else:
-        offset = _starts(backend, count)
-        half_faces = _sorted(scene, offset, count, *_fill(scene, finders, offset, count))
-    return EntryLists(offset, count, half_faces, has_starts, is_simple)
+
+    count: Any
+    half_faces: Any
+    most: Any
+    total: Any
 
 
-def _count(scene: Scene, finders: Sequence[Finder]) -> tuple[Any, Any]:
-    """Number of entries of each ray, and one of them, which is all where no ray has more."""
-    uint = scene.backend.UInt
-    count, half_faces = dr.zeros(uint, scene.rays.count), dr.zeros(uint, scene.rays.count)
+def count_entries(search: EntrySearch, rays: int) -> EntryCounts:
+    """Count the entries of N rays, for :func:`difftetvr.recording.replayed`."""
+    uint = search.scene.backend.UInt
+    count, half_faces = dr.zeros(uint, rays), dr.zeros(uint, rays)
 
     def visit(hit: Hit) -> None:
         dr.scatter_add(count, uint(1), hit.pixel, hit.is_hit)
         dr.scatter(half_faces, hit.half_face, hit.pixel, hit.is_hit)
 
-    for for_each in finders:
-        for_each(visit)
-        scene.backend.run(count, half_faces)
-    return count, half_faces
+    search.for_each(visit, lambda: dr.eval(count, half_faces))
+    most, total = dr.max(count), dr.sum(count)
+    dr.eval(most, total)
+    return EntryCounts(count, half_faces, most, total)
 
 
-def _starts(backend: Backend, count: Any) -> Any:
-    """Where each ray's list starts: the exclusive prefix sum of the lengths."""
-    counts = backend.tensor(backend.Int(count))
-    return backend.uints((counts.cumsum(0) - counts).to(torch.int32))
+def list_entries(search: EntrySearch, counts: EntryCounts, most: int, total: int, has_starts: bool) -> EntryLists:
+    """Entry lists of every ray of a view.
+
+    Args:
+        search: Finds them.
+        counts: How many there are.
+        most: The greatest number of entries of a ray.
+        total: Number of all entries.
+        has_starts: Whether rays may start inside the mesh.
+    """
+    rays = search.scene.rays.count
+    if most <= 1:
+        return EntryLists(search.scene.backend.lanes(rays), counts.count, counts.half_faces, has_starts, True)
+    offset, half_faces = replayed(_fill, search, counts.count, few_lengths(total), rays)
+    return EntryLists(offset, counts.count, half_faces, has_starts, False)
 
 
-def _fill(scene: Scene, finders: Sequence[Finder], offset: Any, count: Any) -> tuple[Any, Any]:
-    """Half-faces of every ray and their depths, in any order within a ray."""
-    uint, real, last = scene.backend.UInt, scene.backend.Float, scene.rays.count - 1
-    total = int(offset[last]) + int(count[last])
-    half_faces, depths, used = dr.zeros(uint, total), dr.zeros(real, total), dr.zeros(uint, scene.rays.count)
-    scene.backend.run(half_faces, depths, used)
+def find_entries(search: EntrySearch, has_starts: bool) -> EntryLists:
+    """Count and list the entries of every ray."""
+    counts = replayed(count_entries, search, search.scene.rays.count)
+    return list_entries(search, counts, int(counts.most[0]), int(counts.total[0]), has_starts)
+
+
+def _fill(search: EntrySearch, count: Any, total: int, rays: int) -> tuple[Any, Any]:
+    """Where each ray's list starts, and the lists."""
+    uint, real = search.scene.backend.UInt, search.scene.backend.Float
+    offset = dr.prefix_sum(count)
+    half_faces, depths, used = dr.zeros(uint, total), dr.zeros(real, total), dr.zeros(uint, rays)
 
     def visit(hit: Hit) -> None:
         slot = dr.gather(uint, offset, hit.pixel, hit.is_hit) + dr.scatter_inc(used, hit.pixel, hit.is_hit)
         dr.scatter(half_faces, hit.half_face, slot, hit.is_hit)
         dr.scatter(depths, hit.depth, slot, hit.is_hit)
 
-    for for_each in finders:
-        for_each(visit)
-        scene.backend.run(half_faces, depths)
-    return half_faces, depths
+    dr.eval(offset, half_faces, depths, used)
+    search.for_each(visit, lambda: dr.eval(half_faces, depths, used))
+    return offset, _sorted(search.scene, offset, count, half_faces, depths)
 
 
 def _sorted(scene: Scene, offset: Any, count: Any, half_faces: Any, depths: Any) -> Any:
@@ -133,5 +136,5 @@ def _sorted(scene: Scene, offset: Any, count: Any, half_faces: Any, depths: Any)
         return (position + 1,)
 
     dr.while_loop((uint(offset),), lambda position: position < end, place)
-    scene.backend.run(ordered)
+    dr.eval(ordered)
     return ordered

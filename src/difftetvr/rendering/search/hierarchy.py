@@ -16,8 +16,8 @@ import drjit as dr
 import torch
 
 from difftetvr.backend import Backend
-from difftetvr.mesh import TetMesh
 from difftetvr.mesh.arrays import chunks
+from difftetvr.mesh.topology.topology import Topology
 from difftetvr.rendering.traversal.rays import Frame, rounding_of
 
 CELLS_OF_A_LEAF = 2
@@ -45,10 +45,10 @@ class SortedItems:
         return SortedItems(items[order].to(torch.int32), corners[order].to(torch.int32))
 
 
-def sorted_cells(mesh: TetMesh, vertices: torch.Tensor) -> SortedItems:
+def sorted_cells(topology: Topology, vertices: torch.Tensor) -> SortedItems:
     """All cells of a mesh, sorted by where they are among (V, 3) vertices the first time."""
-    cells = torch.arange(mesh.num_cells, device=mesh.tets.device)
-    return mesh.topology.cached("hierarchy.cells", lambda: SortedItems.of(cells, mesh.tets, vertices.detach()))
+    cells = torch.arange(topology.num_cells, device=topology.tets.device)
+    return topology.cached("hierarchy.cells", lambda: SortedItems.of(cells, topology.tets, vertices.detach()))
 
 
 @dataclass

@@ -7,15 +7,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
-import torch
 
 from difftetvr.rendering.search.hits import Hit
-from difftetvr.rendering.search.scene import Scene
+from difftetvr.rendering.search.scene import NONE, Scene
 from difftetvr.rendering.traversal.rays import largest_coordinate, pixel_lane, rounding_of
 from difftetvr.rendering.traversal.walk import Corner, crossing_depth, holds_ray, interpolate, make_face
 
 _ITEM_PIXELS = 64  # a work item has about so many pixels, at most _ITEM_ROWS rows, and at least one
 _ITEM_ROWS = 8
+_MOST_WORKERS = 1 << 18
 
 
 @dataclass
@@ -23,43 +23,61 @@ class WorkItems:
     """Pieces of faces to rasterise: each is some image rows of one face's bounding box.
 
     Attributes:
-        half_face: The face.
-        first_row, last_row, first_column, last_column: The pixels, ends included.
+        half_face: (F,) the faces.
+        ends: (F,) number of items of each face and all before it.
+        rows: (F,) image rows of one item.
+        first_row, last_row, first_column, last_column: (F,) the pixels of each face's box, ends included.
+        worker: (L,) numbers of the lanes that share the items.
     """
 
     half_face: Any
+    ends: Any
+    rows: Any
     first_row: Any
     last_row: Any
     first_column: Any
     last_column: Any
+    worker: Any
+
+    def owner(self, item: Any) -> Any:
+        """The face that an item is of: the first whose end lies beyond it."""
+        uint = type(item)
+        count = dr.width(self.ends)
+
+        def halve(step: Any, place: Any) -> tuple[Any, Any]:
+            beyond = place + step
+            is_before = (beyond < count) & (dr.gather(uint, self.ends, beyond - 1, beyond < count) <= item)
+            return step >> 1, dr.select(is_before, beyond, place)
+
+        first = dr.full(uint, 1 << max(0, (count - 1).bit_length() - 1), dr.width(item))
+        return dr.while_loop((first, dr.zeros(uint, dr.width(item))), lambda step, place: step > 0, halve)[1]
 
 
-def work_items(scene: Scene, half_face: Any) -> WorkItems | None:
-    """Work items of some half-faces, None if none of them is in sight; the scene's rays are a camera's."""
-    backend, uint, integer = scene.backend, scene.backend.UInt, scene.backend.Int
-    faces = dr.width(half_face)
-    points = [scene.point(vertex) for vertex in scene.indices_and_apex(half_face)[:3]]
-    (column0, column1), (row0, row1), visible = scene.image.pixel_range(backend, points)
-    width = dr.fmax(scene.backend.Float(column1 - column0 + 1), 1.0)
-    per_item = integer(dr.fmin(dr.fmax(_ITEM_PIXELS / width, 1.0), float(_ITEM_ROWS)))
-    count = dr.select(visible & _may_face_camera(points), (row1 - row0 + per_item) // per_item, 0)
-    backend.run(count, row0, row1, column0, column1, per_item)
-    counts = backend.tensor(count)
-    owners = torch.repeat_interleave(
-        torch.arange(faces, dtype=torch.int32, device=backend.device), counts, output_size=int(counts.sum())
-    )
-    if owners.shape[0] == 0:
-        return None
-    begins = (counts.cumsum(0) - counts).to(torch.int32)
-    owner = backend.uints(owners)
-    index = integer(dr.arange(uint, owners.shape[0]) - dr.gather(uint, backend.uints(begins), owner))
-    step = dr.gather(integer, per_item, owner)
-    first = dr.gather(integer, row0, owner) + index * step
-    last = dr.fmin(backend.Float(first + step - 1), backend.Float(dr.gather(integer, row1, owner)))
-    columns = (uint(dr.gather(integer, column, owner)) for column in (column0, column1))
-    items = WorkItems(dr.gather(uint, half_face, owner), uint(first), uint(integer(last)), *columns)
-    backend.run(items)
-    return items
+def workers_for(faces: int, pixels: int) -> int:
+    """A number of lanes, out of few, that shares the work items of some faces in an image evenly."""
+    return min(1 << (faces + pixels // _ITEM_PIXELS).bit_length(), _MOST_WORKERS)
+
+
+def work_items(scene: Scene, half_face: Any, worker: Any) -> WorkItems:
+    """Work items of some half-faces; the scene's rays are a camera's.
+
+    Args:
+        scene: The cells and the rays.
+        half_face: (F,) the faces, `NONE` for none.
+        worker: (L,) numbers of the lanes that are to share the items, see :func:`workers_for`.
+    """
+    real, uint, integer = scene.backend.Float, scene.backend.UInt, scene.backend.Int
+    is_face = half_face != NONE
+    points = [scene.point(vertex, is_face) for vertex in scene.indices_and_apex(half_face, is_face)[:3]]
+    (column0, column1), (row0, row1), visible = scene.image.pixel_range(scene.backend, points)
+    width = dr.fmax(real(column1 - column0 + 1), 1.0)
+    rows = integer(dr.fmin(dr.fmax(_ITEM_PIXELS / width, 1.0), float(_ITEM_ROWS)))
+    count = dr.select(is_face & visible & _may_face_camera(points), (row1 - row0 + rows) // rows, 0)
+    parts = [uint(part) for part in (count, rows, row0, row1, column0, column1)]
+    dr.eval(parts)
+    ends = dr.cumsum(parts[0])
+    dr.eval(ends)
+    return WorkItems(half_face, ends, parts[1], parts[2], parts[3], parts[4], parts[5], worker)
 
 
 def _may_face_camera(points: list[list[Any]]) -> Any:
@@ -77,11 +95,47 @@ def _norm(vector: list[Any]) -> Any:
     return dr.abs(vector[0]) + dr.abs(vector[1]) + dr.abs(vector[2])
 
 
-def for_each_hit(scene: Scene, items: WorkItems | None, visit: Callable[[Hit], None]) -> None:
+def for_each_hit(scene: Scene, items: WorkItems, visit: Callable[[Hit], None]) -> None:
     """Call ``visit`` for each pixel of each work item."""
-    if items is None:
-        return
-    vertices = scene.indices_and_apex(items.half_face)[:3]
+    uint, workers = scene.backend.UInt, dr.width(items.worker)
+    total = dr.gather(uint, items.ends, uint(dr.width(items.ends) - 1))
+
+    def at_item(item: Any) -> tuple[Any]:
+        owner = items.owner(item)
+        begin = dr.gather(uint, items.ends, owner - 1, owner > 0)
+        half_face, rows, first_row, last_row, first_column, last_column = (
+            dr.gather(uint, part, owner)
+            for part in (
+                items.half_face,
+                items.rows,
+                items.first_row,
+                items.last_row,
+                items.first_column,
+                items.last_column,
+            )
+        )
+        first_row += (item - begin) * rows
+        last = first_row + rows - 1
+        box = PixelBox(first_row, dr.select(last < last_row, last, last_row), first_column, last_column)
+        _for_each_pixel(scene, half_face, box, visit)
+        return (item + workers,)
+
+    dr.while_loop((uint(items.worker),), lambda item: item < total, at_item)
+
+
+@dataclass
+class PixelBox:
+    """Pixels of an image, ends included."""
+
+    first_row: Any
+    last_row: Any
+    first_column: Any
+    last_column: Any
+
+
+def _for_each_pixel(scene: Scene, half_face: Any, box: PixelBox, visit: Callable[[Hit], None]) -> None:
+    """Call ``visit`` for the pixels that may see a half-face."""
+    vertices = scene.indices_and_apex(half_face)[:3]
     points = [scene.point(vertex) for vertex in vertices]
     nearest = dr.fmin(points[0][2], dr.fmin(points[1][2], points[2][2]))
     passes_camera = nearest <= rounding_of(largest_coordinate(points))
@@ -100,10 +154,8 @@ def for_each_hit(scene: Scene, items: WorkItems | None, visit: Callable[[Hit], N
         depth = dr.if_stmt((face,), passes_camera, exact, simple)
         is_hit = holds_ray(face) & (~passes_camera | (depth > 0))
         pixel = row * scene.image.width + column
-        visit(Hit(pixel, pixel_lane(scene.image, column, row), items.half_face, depth, is_hit))
-        ends = column == items.last_column
-        return dr.select(ends, items.first_column, column + 1), dr.select(ends, row + 1, row)
+        visit(Hit(pixel, pixel_lane(scene.image, column, row), half_face, depth, is_hit))
+        ends = column == box.last_column
+        return dr.select(ends, box.first_column, column + 1), dr.select(ends, row + 1, row)
 
-    uint = scene.backend.UInt
-    start = (uint(items.first_column), uint(items.first_row))
-    dr.while_loop(start, lambda column, row: row <= items.last_row, body)
+    dr.while_loop((box.first_column, box.first_row), lambda column, row: row <= box.last_row, body)

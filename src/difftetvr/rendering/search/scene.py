@@ -13,8 +13,7 @@ import drjit as dr
 import torch
 
 from difftetvr.backend import Backend
-from difftetvr.mesh import TetMesh
-from difftetvr.mesh.topology.topology import LOCAL_FACES
+from difftetvr.mesh.topology.topology import LOCAL_FACES, Topology
 from difftetvr.rendering.traversal.rays import Frame, ImageRays, KernelRays, edge_function, is_left
 from difftetvr.rendering.traversal.walk import Corner, Face, make_face
 
@@ -50,15 +49,18 @@ class Scene(Cells):
     """The cells of a mesh in the space of some rays that may cross them.
 
     Attributes:
+        vertices: Flat (V, 4 ``stride``) records, which begin with x, y and z.
         rays: The rays.
+        stride: Packets of four floats a record.
     """
 
     rays: KernelRays
+    stride: int
 
-    @staticmethod
-    def of(backend: Backend, rays: KernelRays, mesh: TetMesh, vertices: torch.Tensor) -> Scene:
-        """Upload a mesh with (V, 3) vertices in the space of the rays."""
-        return Scene(backend, backend.floats(vertices), backend.uints(mesh.tets), rays)
+    def point(self, vertex: Any, mask: Any = True) -> list[Any]:
+        """Position of a vertex."""
+        record = dr.gather(self.backend.Float4, self.vertices, self.stride * vertex, mask)
+        return [record[0], record[1], record[2]]
 
     @property
     def image(self) -> ImageRays:
@@ -106,10 +108,10 @@ class Scene(Cells):
         return is_hit & mask, 4 * cell + local
 
 
-def boundary_half_faces(mesh: TetMesh) -> torch.Tensor:
+def boundary_half_faces(topology: Topology) -> torch.Tensor:
     """(B,) int32 half-faces on the boundary of a mesh."""
 
     def build() -> torch.Tensor:
-        return torch.nonzero(mesh.topology.cell_adjacency.reshape(-1) < 0).flatten().to(torch.int32)
+        return torch.nonzero(topology.cell_adjacency.reshape(-1) < 0).flatten().to(torch.int32)
 
-    return mesh.topology.cached("boundary_half_faces", build)
+    return topology.cached("boundary_half_faces", build)

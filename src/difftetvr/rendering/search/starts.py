@@ -13,15 +13,16 @@ from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
-import torch
 
-from difftetvr.backend import Backend
-from difftetvr.mesh import TetMesh
 from difftetvr.mesh.topology.topology import LOCAL_FACES
+from difftetvr.recording import few_lengths, replayed
 from difftetvr.rendering.search.hits import Hit
 from difftetvr.rendering.search.scene import Scene
 from difftetvr.rendering.traversal.rays import Lanes
 from difftetvr.rendering.traversal.walk import BOUNDARY, crossing_depth, find_exit
+
+AROUND = 1 << 10
+"""Cells around a camera that there is room for at first: mostly there is one."""
 
 NEAR = 1e-4
 """Cells this near to an origin, relative to their size, are tried as the cell that holds it; each ray then decides."""
@@ -90,57 +91,79 @@ def _rounding(face: Any) -> Any:
     return 16.0 * dr.epsilon(size) * size
 
 
-def for_each_start_at_camera(scene: Scene, mesh: TetMesh, around: torch.Tensor, visit: Callable[[Hit], None]) -> None:
-    """Call ``visit`` for the cells in which rays of a camera may start.
-
-    Args:
-        scene: The cells, and the camera's rays.
-        mesh: Mesh, for its adjacency.
-        around: Cells around the camera.
-        visit: Takes a hit.
-    """
-    backend, uint = scene.backend, scene.backend.UInt
-    lane = dr.arange(uint, scene.rays.lane_count)
-    rays = scene.rays.of_lanes(lane)
-    cells, count = backend.uints(around), backend.opaque_uint(around.shape[0])
-    near = dr.zeros(backend.Float, scene.rays.lane_count)
-    search = StartSearch(scene, backend.uints(mesh.topology.cell_adjacency), rays, lane, near)
+def for_each_start_at_camera(scene: Scene, starts: CameraStarts, visit: Callable[[Hit], None]) -> None:
+    """Call ``visit`` for all cells in which rays of a camera may start."""
+    uint, lanes = scene.backend.UInt, dr.width(starts.lane)
+    rays = scene.rays.of_lanes(starts.lane)
+    search = StartSearch(scene, starts.adjacency, rays, starts.lane, dr.zeros(scene.backend.Float, lanes))
+    count = dr.gather(uint, starts.count, uint(0))
 
     def body(index: Any) -> tuple[Any]:
-        search.look_at(dr.gather(uint, cells, index), rays.valid, visit)
+        search.look_at(dr.gather(uint, starts.cells, index), rays.valid, visit)
         return (index + 1,)
 
-    dr.while_loop((dr.zeros(uint, scene.rays.lane_count),), lambda index: index < count, body)
+    dr.while_loop((dr.zeros(uint, lanes),), lambda index: index < count, body)
 
 
-def cells_around_camera(backend: Backend, mesh: TetMesh, camera_vertices: torch.Tensor) -> torch.Tensor | None:
-    """Cells that may hold the camera: it lies in them or very near; None if there are none."""
-    positions = camera_vertices.detach()
-    # One axis after the other: most cameras look at the mesh from outside, and z says so.
-    if any(positions[:, axis].amin() > 0 or positions[:, axis].amax() < 0 for axis in (2, 0, 1)):
-        return None
-    vertices, tets = backend.floats(positions), backend.uints(mesh.tets)
-    cell = dr.arange(backend.UInt, mesh.num_cells)
-    points = []
-    for k in range(4):
-        index = dr.gather(backend.UInt, tets, 4 * cell + k)
-        points.append([dr.gather(backend.Float, vertices, 3 * index + axis) for axis in range(3)])
+@dataclass
+class CameraStarts:
+    """Cells in which rays of a camera may start.
 
-    extent, around = backend.Float(0), backend.Bool(True)
-    lows, highs = [], []
+    Attributes:
+        cells: (capacity,) the cells around it, in any order.
+        count: (1,) their number, which may be greater than the capacity.
+        adjacency: Flat (T, 4) cells behind the half-faces.
+        lane: Numbers of all lanes.
+    """
+
+    cells: Any
+    count: Any
+    adjacency: Any
+    lane: Any
+
+
+def cells_around_camera(scene: Scene, cell: Any, extent: Any, capacity: int) -> tuple[Any, Any]:
+    """Cells that may hold the camera: it lies in them or very near.
+
+    Args:
+        scene: The cells, in the space of the camera.
+        cell: (T,) their numbers.
+        extent: Greatest of x, -x, y, -y, z and -z of any vertex: most cameras look at the mesh from outside.
+        capacity: How many cells there is room for.
+
+    Returns:
+        (capacity,) the cells, in any order, and (1,) their number.
+    """
+    backend, uint, real = scene.backend, scene.backend.UInt, scene.backend.Float
+    around = backend.Bool(True)
+    for k in range(6):
+        around &= dr.gather(real, extent, uint(k)) >= 0
+    corners = scene.cell(cell, around)
+    points = [scene.point(corners[k], around) for k in range(4)]
+    size, lows, highs = real(0), [], []
     for axis in range(3):
         values = [point[axis] for point in points]
         lows.append(dr.fmin(dr.fmin(values[0], values[1]), dr.fmin(values[2], values[3])))
         highs.append(dr.fmax(dr.fmax(values[0], values[1]), dr.fmax(values[2], values[3])))
-        extent = dr.fmax(extent, highs[axis] - lows[axis])
-    margin = NEAR * extent
+        size = dr.fmax(size, highs[axis] - lows[axis])
+    margin = NEAR * size
     for low, high in zip(lows, highs, strict=True):
         around &= (low <= margin) & (high >= -margin)
     # The camera is the origin: with an outward face of a cell around it, it spans a positive volume.
     for i, j, k in LOCAL_FACES:
-        around &= _triple(points[i], points[j], points[k]) >= -NEAR * extent * extent * extent
-    found = dr.compress(around)
-    return None if dr.width(found) == 0 else backend.tensor(backend.Int(found))
+        around &= _triple(points[i], points[j], points[k]) >= -NEAR * size * size * size
+    found, used = dr.empty(uint, capacity), dr.zeros(uint, 1)
+    place: Any = dr.scatter_inc(used, uint(0), around)
+    dr.scatter(found, cell, place, around & (place < capacity))
+    dr.eval(found, used)
+    return found, used
+
+
+def find_cells_around(scene: Scene, cell: Any, extent: Any, capacity: int = AROUND) -> tuple[Any, int]:
+    """All cells that may hold the camera, and their number; arguments as in :func:`cells_around_camera`."""
+    cells, used = replayed(cells_around_camera, scene, cell, extent, capacity)
+    count = int(used[0])
+    return (cells, count) if count <= int(capacity) else find_cells_around(scene, cell, extent, few_lengths(count))
 
 
 def _triple(p: list[Any], q: list[Any], r: list[Any]) -> Any:

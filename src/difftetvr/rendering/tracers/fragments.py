@@ -13,12 +13,12 @@ from typing import Any
 import drjit as dr
 import torch
 
-from difftetvr.mesh import TetMesh
-from difftetvr.rendering.search.bundle_hits import BundleScene
+from difftetvr.rendering.search.bundle_hits import BundleSearch
 from difftetvr.rendering.search.hits import Hit
-from difftetvr.rendering.search.rasterise import for_each_hit, work_items
-from difftetvr.rendering.search.scene import NONE, Scene
-from difftetvr.rendering.search.starts import cells_around_camera
+from difftetvr.rendering.search.rasterise import for_each_hit, work_items, workers_for
+from difftetvr.rendering.search.scene import NONE
+from difftetvr.rendering.search.starts import find_cells_around
+from difftetvr.rendering.tracers.aim import Aim
 from difftetvr.rendering.tracers.bands import Band
 from difftetvr.rendering.traversal.bundle import BundleRays
 from difftetvr.rendering.traversal.walk import crossing_depth, find_exit, holds_ray
@@ -46,20 +46,21 @@ class FragmentLists:
 class FragmentRaster:
     """Finds the fragments of a view."""
 
-    def __init__(self, scene: Scene, mesh: TetMesh, vertices: torch.Tensor, limits: Any | None) -> None:
-        """Take the scene.
+    def __init__(self, aim: Aim) -> None:
+        """Take a view."""
+        self.scene, backend = aim.scene, aim.scene.backend
+        self.half_faces = 4 * aim.ordered.order.topology.num_cells
+        self.bundle, self.around, self.around_count = None, None, 0
+        if isinstance(self.scene.rays, BundleRays):
+            self.bundle = BundleSearch.for_fragments(self.scene, aim.ordered, aim.view.limits)
+            return
+        cells = backend.lanes(self.half_faces // 4)
+        self.around, self.around_count = find_cells_around(self.scene, cells, aim.ordered.extent)
 
-        Args:
-            scene: The cells and the rays.
-            mesh: The mesh.
-            vertices: (V, 3) its vertices in the space of the rays.
-            limits: (N, 2) distances between which each ray is looked at; None for all in front of it.
-        """
-        self.scene = scene
-        self.half_faces = 4 * mesh.num_cells
-        self.bundle = BundleScene(scene, mesh, vertices, limits) if isinstance(scene.rays, BundleRays) else None
-        around = None if self.bundle else cells_around_camera(scene.backend, mesh, vertices)
-        self.around = None if around is None else scene.backend.uints(around)
+    @property
+    def starts_inside(self) -> bool:
+        """Whether some crossings begin behind the camera."""
+        return self.around_count > 0
 
     def count(self) -> torch.Tensor:
         """(lanes,) int64 number of fragments of each lane: its depth complexity."""
@@ -105,10 +106,12 @@ class FragmentRaster:
             return
         for begin in range(0, self.half_faces, _FACES_AT_A_TIME):
             count = min(_FACES_AT_A_TIME, self.half_faces - begin)
-            items = work_items(self.scene, dr.arange(backend.UInt, count) + backend.opaque_uint(begin))
+            half_face = dr.arange(backend.UInt, count) + backend.opaque_uint(begin)
+            worker = backend.lanes(workers_for(count, self.scene.rays.count))
+            items = work_items(self.scene, half_face, worker)
             for_each_hit(self.scene, items, visit)
             backend.run(results)
-        if self.around is not None:
+        if self.around_count:
             self._for_each_around(visit)
             backend.run(results)
 
@@ -117,7 +120,7 @@ class FragmentRaster:
         scene, uint = self.scene, self.scene.backend.UInt
         lane = dr.arange(uint, scene.rays.lane_count)
         rays = scene.rays.of_lanes(lane)
-        count = scene.backend.opaque_uint(4 * dr.width(self.around))
+        count = scene.backend.opaque_uint(4 * self.around_count)
 
         def body(index: Any) -> tuple[Any]:
             half_face = 4 * dr.gather(uint, self.around, index >> 2) + (index & 3)

@@ -12,11 +12,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
-import torch
 
 from difftetvr.backend import Backend
-from difftetvr.mesh import TetMesh
-from difftetvr.rendering.search.scene import NONE, Scene
+from difftetvr.rendering.search.scene import NONE
+from difftetvr.rendering.tracers.aim import Aim
 from difftetvr.rendering.tracers.bands import Band, bands_of
 from difftetvr.rendering.tracers.fragments import FragmentLists, FragmentRaster
 from difftetvr.rendering.traversal.crossing import Kernel, View, cross_cell, lanes_of
@@ -46,9 +45,9 @@ class LinkedList:
     local_size: int
 
     @staticmethod
-    def of(view: View, mesh: TetMesh, vertices: torch.Tensor) -> LinkedList:
-        """Prepare a view of a mesh with (V, 3) vertices in the space of the rays."""
-        raster = FragmentRaster(Scene.of(view.backend, view.rays, mesh, vertices), mesh, vertices, view.limits)
+    def of(aim: Aim) -> LinkedList:
+        """Count the fragments of every ray."""
+        view, raster = aim.view, FragmentRaster(aim)
         counts = raster.count()
         longest = int(counts.max())
         size = next((size for size in LOCAL_SIZES if size >= longest), LOCAL_SIZES[-1])
@@ -57,7 +56,7 @@ class LinkedList:
     @property
     def starts_inside(self) -> bool:
         """Whether some crossings begin behind the camera."""
-        return self.raster.around is not None
+        return self.raster.starts_inside
 
     def trace(self, make_kernel: Callable[[Lanes], Kernel]) -> None:
         """Sort every ray's fragments and cross their cells, front to back."""

@@ -10,14 +10,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
-import torch
 
-from difftetvr.mesh import TetMesh
+from difftetvr.rendering.search.bundle_hits import BundleSearch
 from difftetvr.rendering.search.entry import EntryLists, find_entries
 from difftetvr.rendering.search.scene import Scene
+from difftetvr.rendering.tracers.aim import Aim
 from difftetvr.rendering.traversal.crossing import Kernel, Step, View, lanes_of
 from difftetvr.rendering.traversal.rays import Lanes
-from difftetvr.rendering.traversal.walk import BOUNDARY, Face, interpolate, make_face, table_row, walk_table
+from difftetvr.rendering.traversal.walk import BOUNDARY, Face, interpolate, make_face, table_row
 
 
 @dataclass
@@ -37,11 +37,13 @@ class Marching:
     entries: EntryLists
 
     @staticmethod
-    def of(view: View, mesh: TetMesh, vertices: torch.Tensor) -> Marching:
-        """Prepare a view of a mesh with (V, 3) vertices in the space of the rays."""
-        table = view.backend.uints(walk_table(mesh))
-        scene = Scene.of(view.backend, view.rays, mesh, vertices)
-        return Marching(view, scene, table, find_entries(scene, mesh, vertices, view.limits))
+    def of(aim: Aim) -> Marching:
+        """Find where rays enter the mesh."""
+        view, entries = aim.view, aim.entries
+        if entries is None:
+            search = BundleSearch.for_entries(aim.scene, aim.ordered, view.limits)
+            entries = find_entries(search, has_starts=view.limits is not None)
+        return Marching(view, aim.scene, aim.ordered.tables.walk, entries)
 
     @property
     def starts_inside(self) -> bool:

@@ -13,10 +13,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
-import torch
 
-from difftetvr.mesh import TetMesh
 from difftetvr.rendering.search.scene import Scene
+from difftetvr.rendering.tracers.aim import Aim
 from difftetvr.rendering.tracers.cell_order import visibility_order
 from difftetvr.rendering.tracers.tiles import TILE_BITS, TileLists, Tiler
 from difftetvr.rendering.traversal.crossing import Kernel, View, cross_cell, lanes_of
@@ -47,9 +46,10 @@ class Projected:
     starts_inside: bool
 
     @staticmethod
-    def of(view: View, mesh: TetMesh, vertices: torch.Tensor) -> Projected:
-        """Prepare a view of a mesh with (V, 3) vertices in camera space."""
-        cells = visibility_order(mesh, vertices)
+    def of(aim: Aim) -> Projected:
+        """Order the cells of a mesh in camera space."""
+        vertices = aim.ordered.positions
+        cells = visibility_order(aim.ordered.order.mesh(aim.mesh), vertices)
         if not cells.exact:
             warnings.warn(
                 "The cells of this mesh have no certain front-to-back order for the whole view (it is not convex, has "
@@ -58,9 +58,8 @@ class Projected:
                 OrderWarning,
                 stacklevel=2,
             )
-        scene = Scene.of(view.backend, view.rays, mesh, vertices)
-        starts_inside = bool(vertices.detach()[:, 2].amin() <= 0)
-        return Projected(view, scene, Tiler(scene, cells.order, PAIR_BUDGET), starts_inside)
+        starts_inside = bool(vertices[:, 2].amin() <= 0)
+        return Projected(aim.view, aim.scene, Tiler(aim.scene, cells.order, PAIR_BUDGET), starts_inside)
 
     def trace(self, make_kernel: Callable[[Lanes], Kernel]) -> None:
         """Cross the cells of every tile, front to back."""

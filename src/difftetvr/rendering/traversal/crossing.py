@@ -16,7 +16,7 @@ import drjit as dr
 from difftetvr.backend import Backend
 from difftetvr.optics import OpticalModel
 from difftetvr.rendering.traversal.rays import Frame, KernelRays, Lanes
-from difftetvr.rendering.traversal.records import PACKET, Records, gather_values, packets_of
+from difftetvr.rendering.traversal.records import Records, gather_values, packets_of
 from difftetvr.rendering.traversal.transfer import Transfer
 from difftetvr.rendering.traversal.walk import Corner, Exit, Face, find_exit, interpolate, make_face
 
@@ -37,6 +37,7 @@ class View:
         transfer: Transfer function of the vertices' scalars, None where vertices have densities and channels.
         threshold: Transmittance at or below which light counts as gone, as a device value.
         limits: (N, 2) distances between which each ray is looked at, None for all in front of its origin.
+        lane: The numbers of all lanes.
     """
 
     backend: Backend
@@ -48,6 +49,7 @@ class View:
     transfer: Transfer | None
     threshold: Any
     limits: Any | None
+    lane: Any
 
     @property
     def records(self) -> Records:
@@ -60,26 +62,11 @@ class View:
         return self.channels > 0 and self.cells is None and self.transfer is None
 
 
-def vertex_records(backend: Backend, vertices: Any, density: Any, channels: Any, count: int) -> Any:
-    """Flat records x, y, z, density and ``count`` channels from flat arrays, in one pass on all cores."""
-    real, stride = backend.Float, 1 + packets_of(count)
-    vertex = dr.arange(backend.UInt, dr.width(density))
-    position = [dr.gather(real, vertices, 3 * vertex + k) for k in range(3)]
-    values = [*position, density, *(dr.gather(real, channels, count * vertex + k) for k in range(count))]
-    values += [real(0)] * (PACKET * stride - len(values))
-    records = dr.empty(real, PACKET * stride * dr.width(density))
-    for k in range(stride):
-        dr.scatter(records, backend.Float4(*values[PACKET * k : PACKET * (k + 1)]), stride * vertex + k)
-    backend.run(records)
-    return records
-
-
 def lanes_of(view: View, first: int = 0, last: int | None = None) -> Lanes:
     """All rays of a view, one a lane; or those of the lanes from ``first`` to before ``last``."""
-    lane = dr.arange(view.backend.UInt, (view.rays.lane_count if last is None else last) - first)
-    if first:
-        lane += view.backend.opaque_uint(first)
-    return view.rays.of_lanes(lane)
+    if last is None:
+        return view.rays.of_lanes(view.lane)
+    return view.rays.of_lanes(dr.arange(view.backend.UInt, last - first) + view.backend.opaque_uint(first))
 
 
 @dataclass

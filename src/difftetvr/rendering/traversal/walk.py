@@ -13,7 +13,7 @@ from typing import Any
 import drjit as dr
 import torch
 
-from difftetvr.mesh import TetMesh
+from difftetvr.mesh.topology.topology import Topology
 from difftetvr.rendering.traversal.rays import edge_function, is_left
 
 BOUNDARY = 0xFFFFFFFF
@@ -154,7 +154,7 @@ def find_exit(face: Face, apex: Corner) -> Exit:
     return Exit(dropped, edges)
 
 
-def walk_table(mesh: TetMesh) -> torch.Tensor:
+def walk_table(topology: Topology) -> torch.Tensor:
     """(4 T, 2) int32 table of the walk: entry 4 c + r holds what lies behind the face opposite cell c's r-th vertex.
 
     The vertices of a cell are ranked by index, so a kernel finds r from the four indices alone. An entry is (next
@@ -162,8 +162,7 @@ def walk_table(mesh: TetMesh) -> torch.Tensor:
     """
 
     def build() -> torch.Tensor:
-        tets = mesh.tets
-        adjacency = mesh.topology.cell_adjacency
+        tets, adjacency = topology.tets, topology.cell_adjacency
         order = tets.argsort(dim=1)
         ranked = torch.gather(tets, 1, order)
         neighbors = torch.gather(adjacency, 1, order)
@@ -173,7 +172,7 @@ def walk_table(mesh: TetMesh) -> torch.Tensor:
         table = torch.stack([neighbors, torch.where(neighbors >= 0, across, 0)], dim=2)
         return table.to(torch.int32).reshape(-1, 2).contiguous()
 
-    return mesh.topology.cached("walk_table", build)
+    return topology.cached("walk_table", build)
 
 
 def table_row(cell: Any, dropped: Any, face: Face, apex: Corner) -> Any:
