@@ -83,11 +83,12 @@ class Backend:
 
         Compute what depends on the view with :meth:`run` before the tensor may go away.
         """
-        return self.Float(self._ready(tensor.detach().to(self.dtype)))
+        tensor = tensor.detach()
+        return self.Float(self._ready(tensor if tensor.dtype == self.dtype else tensor.to(self.dtype)))
 
     def uints(self, tensor: torch.Tensor) -> Any:
         """Flat Dr.Jit view of an int32 tensor as unsigned integers, likewise: -1 becomes 0xFFFFFFFF."""
-        return self.UInt(self._ready(tensor.detach().to(torch.int32)).view(torch.uint32))
+        return self.UInt(self._ready(tensor.detach().to(torch.int32).view(torch.uint32)))
 
     def opaque(self, value: float) -> Any:
         """A scalar as a device value, so that kernels need no recompilation when it changes."""
@@ -113,8 +114,8 @@ class Backend:
     def tensor(self, array: Any, *shape: int) -> torch.Tensor:
         """PyTorch tensor over a Dr.Jit array's memory, without a copy; computes it first, see :meth:`run`."""
         self.run(array)
-        tensor = array.torch()
-        return tensor.reshape(shape) if shape else tensor
+        tensor = torch.from_numpy(array.numpy()) if self.name == "llvm" else array.torch()
+        return tensor.view(shape) if shape else tensor
 
     @contextmanager
     def exclusive(self, one_thread: bool = False) -> Iterator[None]:
@@ -149,9 +150,11 @@ class Backend:
                     dr.sync_thread()
                     dr.set_thread_count(threads)
 
-    def _ready(self, tensor: torch.Tensor) -> torch.Tensor:
+    def _ready(self, tensor: torch.Tensor) -> Any:
         """A tensor's values as kernels can read them: flat, where packets may begin, and written."""
-        flat = tensor.contiguous().reshape(-1)
+        flat = tensor.contiguous().view(-1)
+        if self.name == "llvm":
+            return flat.numpy()  # the same memory, handed over in half the time
         if self.name == "cuda":
             if flat.data_ptr() % _PACKET_BYTES:
                 flat = flat.clone()  # loads of whole packets fault on views that begin in the midst of one

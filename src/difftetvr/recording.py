@@ -8,8 +8,10 @@ may differ from call to call, and all else is part of the *kind* of the call.
 from __future__ import annotations
 
 import enum
+import gc
 from collections.abc import Callable, Hashable, Iterator
-from functools import lru_cache
+from contextlib import contextmanager
+from functools import cache, lru_cache
 from typing import Any
 
 import drjit as dr
@@ -18,6 +20,7 @@ from difftetvr.backend import Backend
 
 _KINDS = 256  # recordings are small, but each also keeps alive what its kind holds
 _RECORDINGS = 16  # of one kind: Dr.Jit records anew where arrays that had one size have several, or the reverse
+_SEQUENCES = (tuple, list)
 _STATIC = (type(None), bool, int, float, str, type, enum.Enum, Backend)
 
 
@@ -45,7 +48,20 @@ def replayed(function: Callable[..., Any], *arguments: Any) -> Any:
     except _Unknown:
         return function(*arguments)
     frozen, call = _frozen(function, kind, dr.thread_count())
-    return frozen(call, arrays)
+    with _no_garbage_collected():
+        return frozen(call, arrays)
+
+
+@contextmanager
+def _no_garbage_collected() -> Iterator[None]:
+    """Where Python frees nothing that it finds by chance: Dr.Jit aborts when a recording sees foreign arrays go."""
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()
 
 
 def few_lengths(count: int) -> int:
@@ -77,18 +93,28 @@ def _frozen(function: Callable[..., Any], kind: Hashable, threads: int) -> tuple
 
 def _split(value: Any, arrays: list[Any]) -> Hashable:
     """A value without its arrays, which are appended to a list."""
-    if isinstance(value, dr.ArrayBase):
+    kind: Any = type(value)
+    names = _contents(kind)
+    if names is None:
+        return value
+    if names is _Array:
         arrays.append(value)
         return _Array
-    if isinstance(value, _STATIC):
-        return value
-    kind = type(value)
-    if kind in (tuple, list):
-        return (kind, tuple([_split(item, arrays) for item in value]))
-    names = getattr(kind, "__match_args__", None)  # of dataclasses: what makes one anew
-    if names is None or len(names) != len(getattr(kind, "__dataclass_fields__", ())):
+    parts = value if kind in _SEQUENCES else [getattr(value, name) for name in names]
+    return (kind, tuple([_split(part, arrays) for part in parts]))
+
+
+@cache
+def _contents(kind: Any) -> Any:
+    """What to split a value of some type into: attributes, or None for nothing; `_Array` where it is an array."""
+    if issubclass(kind, dr.ArrayBase):
+        return _Array
+    if issubclass(kind, _STATIC):
+        return None
+    names = getattr(kind, "__match_args__", ())  # of dataclasses: what makes one anew
+    if kind not in _SEQUENCES and len(names) != len(getattr(kind, "__dataclass_fields__", (*names, ""))):
         raise _Unknown
-    return (kind, tuple([_split(getattr(value, name), arrays) for name in names]))
+    return names
 
 
 def _joined(part: Any, arrays: Iterator[Any]) -> Any:
@@ -99,7 +125,7 @@ def _joined(part: Any, arrays: Iterator[Any]) -> Any:
         return part
     kind, parts = part
     values = [_joined(item, arrays) for item in parts]
-    return kind(values) if kind in (tuple, list) else kind(*values)
+    return kind(values) if kind in _SEQUENCES else kind(*values)
 
 
 class _Array:

@@ -15,10 +15,9 @@ from difftetvr.inputs import as_reals
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.optics import OpticalModel
 from difftetvr.rendering.autograd import RenderFunction
-from difftetvr.rendering.preparation import PreparedView, ViewOptions, prepare_view
+from difftetvr.rendering.preparation import ViewOptions, prepare_view
 from difftetvr.rendering.rays import Rays, RaySource
 from difftetvr.rendering.scalar_field import ScalarField
-from difftetvr.rendering.traversal.records import Records
 
 
 @dataclass(frozen=True)
@@ -170,12 +169,14 @@ def _render(
     behind = as_background(background, mesh.vertices, view.task.channels)
     limits = view.limits(clip_plane)
     if 0 in view.shape:
-        light, distance = (view.vertices[:0, :1].expand(0, n) for n in (Records(view.task.channels).width, 1))
-        return compose(view, light, distance[:, 0], behind, mesh.vertices.dtype)
+        empty = mesh.vertices.new_zeros(view.shape)
+        return RenderedImage(empty[..., None].expand(*view.shape, view.task.channels), empty, empty, empty)
     with view.task.backend.exclusive():
-        tracer = view.tracer(limits)
-    light, distance = RenderFunction.apply(view.task, tracer, view.vertices, view.pose, limits, view.lines, *view.parts)
-    return compose(view, light, distance, behind, mesh.vertices.dtype)
+        shot = view.shot(limits)
+    pixels = RenderFunction.apply(view.task, shot, view.vertices, view.pose, behind, limits, view.lines, *view.parts)
+    if view.task.backend.dtype != mesh.vertices.dtype:
+        pixels = tuple(part.to(mesh.vertices.dtype) for part in pixels)
+    return RenderedImage(*pixels).reshaped(*view.shape)
 
 
 def as_background(background: Any, like: torch.Tensor, channels: int = 3) -> torch.Tensor | None:
@@ -192,25 +193,3 @@ def as_background(background: Any, like: torch.Tensor, channels: int = 3) -> tor
         wanted = "three finite linear RGB components" if channels == 3 else f"one finite number for each of {channels}"
         raise DiffTetError(f"background is {shown(background)}; give {wanted}{'' if channels == 3 else ' channels'}.")
     return behind
-
-
-def compose(
-    view: PreparedView, light: torch.Tensor, distance: torch.Tensor, behind: torch.Tensor | None, dtype: torch.dtype
-) -> RenderedImage:
-    """The image that a kernel's output stands for.
-
-    Args:
-        view: What was rendered.
-        light: (N, width) records of premultiplied channels and optical depth.
-        distance: (N,) integral of the distance in the unit of the view.
-        behind: (C,) channels behind the volume; None for 0.
-        dtype: Precision of the image.
-    """
-    distance = view.world_distance(light, distance).to(dtype)
-    color, optical_depth = (part.to(dtype) for part in Records(view.task.channels).unpack(light))
-    if behind is not None:
-        color = color + torch.exp(-optical_depth)[:, None] * behind
-    alpha = -torch.expm1(-optical_depth)
-    visible = alpha > 0
-    depth = torch.where(visible, distance / torch.where(visible, alpha, 1.0), 0.0)
-    return RenderedImage(color, alpha, depth, optical_depth).reshaped(*view.shape)

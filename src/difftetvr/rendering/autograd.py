@@ -15,6 +15,7 @@ from difftetvr.optics import OpticalModel
 from difftetvr.recording import few_lengths, replayed
 from difftetvr.rendering.cameras.pinhole import Camera
 from difftetvr.rendering.kernels.adjoint import Gradients, ImageAdjoint, Wanted, render_adjoint
+from difftetvr.rendering.kernels.composition import Composition, Pixels
 from difftetvr.rendering.kernels.forward import render_forward
 from difftetvr.rendering.kernels.layout import CellSource, GradientSource, VertexSource, collect
 from difftetvr.rendering.search.memory_order import MemoryOrder, OrderedMesh
@@ -122,58 +123,84 @@ class RenderTask:
             None if limits is None else backend.floats(limits),
             backend.lanes(rays.lane_count),
         )
-        positions = laid_out.positions(upload.vertices.stride, self.mesh.num_vertices)
-        ordered = OrderedMesh(upload.order, upload.tables, positions, laid_out.device_extent)
+        stride, extent = upload.vertices.stride, laid_out.device_extent
+        ordered = OrderedMesh(backend, upload.order, upload.tables, laid_out.records, stride, extent)
         scene = upload.scene(laid_out.records, rays)
         tracer: Tracer = TRACERS[self.renderer].of(Aim(view, scene, ordered, self.mesh, laid_out.entries))
         return tracer
 
 
 class RenderFunction(torch.autograd.Function):
-    """From vertices, pose, limits, rays and content to records of channels and optical depth, and distance.
+    """From vertices, pose, background, limits, rays and content to an image.
 
-    The outputs are (N, width) and (N,). The inputs that may require gradients are what the tracer was made of.
+    The outputs are (N, C) channels, (N,) opacity, expected distance and optical depth. The inputs that may require
+    gradients are what the tracer was made of, and the (C,) background, which may be None.
     """
 
     @staticmethod
-    def forward(
-        ctx: Any, task: RenderTask, tracer: Tracer, vertices: Any, pose: Any, limits: Any, lines: Any, *parts: Any
-    ) -> Any:
-        """Render; keeps only the image and, while gradients are wanted, the tracer."""
-        with task.backend.exclusive():
-            light, distance = render_forward(tracer)
-            image = task.backend.tensor(light, -1, tracer.view.records.width), task.backend.tensor(distance)
+    def forward(ctx: Any, task: RenderTask, shot: Shot, *tensors: Any) -> Any:
+        """Render; keeps only what was gathered and, while gradients are wanted, the tracer."""
+        backend, (vertices, pose, background, _, _, *_) = task.backend, tensors
+        how = Composition(
+            None if background is None or not task.channels else backend.floats(background.clone()),
+            shot.shift,
+            shot.unit,
+        )
+        with backend.exclusive():
+            rendered = render_forward(shot.tracer, how)
+            image = rendered.image
+            channels = backend.tensor(image.color)[: shot.count * task.channels].view(shot.count, task.channels)
+            pixels = channels, *(backend.tensor(part) for part in (image.alpha, image.depth, image.optical_depth))
         ctx.set_materialize_grads(False)
-        ctx.task, ctx.tracer = task, tracer
-        ctx.save_for_backward(*image, vertices if ctx.needs_input_grad[3] else None, pose)
-        return image
+        ctx.task, ctx.shot, ctx.how, ctx.gathered = task, shot, how, (rendered.light, rendered.distance)
+        needs_pose, needs_background = ctx.needs_input_grad[3:5]
+        ctx.save_for_backward(
+            vertices if needs_pose else None, pose, pixels[3] if needs_background and task.channels else None
+        )
+        return pixels
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, g_light: Any, g_distance: Any) -> Any:
+    def backward(ctx: Any, *by_image: Any) -> Any:
         """Go through the crossings again with the image's derivatives."""
-        task, backend, tracer = ctx.task, ctx.task.backend, ctx.tracer
-        light, distance, vertices, pose = ctx.saved_tensors
-        needs_vertices, needs_pose, needs_limits, needs_lines = ctx.needs_input_grad[2:6]
+        task, backend, shot = ctx.task, ctx.task.backend, ctx.shot
+        vertices, pose, optical_depth = ctx.saved_tensors
+        needs_vertices, needs_pose, needs_background, needs_limits, needs_lines = ctx.needs_input_grad[2:7]
         wanted = Wanted(needs_vertices or needs_pose, needs_limits, needs_lines)
+        derivatives = [None if part is None or not part.numel() else backend.floats(part) for part in by_image]
         with backend.exclusive(one_thread=task.deterministic):
-            image = ImageAdjoint(
-                backend.floats(torch.zeros_like(light) if g_light is None else g_light),
-                None if g_distance is None else backend.floats(g_distance),
-                backend.floats(light),
-                backend.floats(distance),
-            )
-            gradients = render_adjoint(tracer, image, task.mesh.num_vertices, wanted)
+            image = ImageAdjoint(Pixels(*derivatives), ctx.how, *ctx.gathered)
+            gradients = render_adjoint(shot.tracer, image, task.mesh.num_vertices, wanted)
             positions, channels, values = _collected(task, gradients, pose)
             by_pose = _by_pose(task, gradients, vertices) if needs_pose else None
-            limits = backend.tensor(gradients.limits, -1, 2) if wanted.limits else None
-            lines = backend.tensor(gradients.lines, -1, 6) if wanted.lines else None
+            limits = backend.tensor(gradients.limits, -1, 2) if needs_limits else None
+            lines = backend.tensor(gradients.lines, -1, 6) if needs_lines else None
             parts = [channels, values]
             if gradients.transfer is not None:
                 table = backend.tensor(gradients.transfer.values).reshape(-1, 4)
                 parts = [values, backend.tensor(gradients.transfer.knots), table]
-        asked = (part if needed else None for part, needed in zip(parts, ctx.needs_input_grad[6:], strict=True))
-        return None, None, positions if needs_vertices else None, by_pose, limits, lines, *asked
+        by_background = None
+        if needs_background and optical_depth is not None and by_image[0] is not None:
+            by_background = (torch.exp(-optical_depth)[:, None] * by_image[0]).sum(0)
+        asked = (part if needed else None for part, needed in zip(parts, ctx.needs_input_grad[7:], strict=True))
+        return None, None, positions if needs_vertices else None, by_pose, by_background, limits, lines, *asked
+
+
+@dataclass(frozen=True)
+class Shot:
+    """What is rendered, ready to be.
+
+    Attributes:
+        tracer: Finds the crossings.
+        count: Number of rays N.
+        shift: (N,) how far kernels' origins are from the rays' true ones; None where they are these.
+        unit: Unit of length of kernels, in world units.
+    """
+
+    tracer: Tracer
+    count: int
+    shift: Any | None
+    unit: float
 
 
 def _collected(task: RenderTask, gradients: Gradients, pose: torch.Tensor | None) -> tuple[Any, Any, Any]:

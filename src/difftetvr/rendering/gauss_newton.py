@@ -10,8 +10,9 @@ from difftetvr.backend import eager
 from difftetvr.errors import DiffTetError, MeshError, shown
 from difftetvr.inputs import as_reals, require_type
 from difftetvr.mesh import Field, TetMesh
-from difftetvr.rendering.api import as_background, compose
+from difftetvr.rendering.api import as_background
 from difftetvr.rendering.cameras.pinhole import Camera
+from difftetvr.rendering.kernels.composition import Composition
 from difftetvr.rendering.kernels.forward import render_forward
 from difftetvr.rendering.kernels.hats import RECORD, HatImage, hat_records
 from difftetvr.rendering.preparation import ViewOptions, prepare_view
@@ -194,9 +195,10 @@ def model_image(
     backend = view.task.backend
     with backend.exclusive(one_thread=deterministic):
         tracer = view.tracer(None)
-        light, distance = render_forward(tracer)
-        gathered = backend.tensor(light, -1, tracer.view.records.width)
-        image = compose(view, gathered, backend.tensor(distance), behind, view.vertices.dtype).color
+        rendered = render_forward(
+            tracer, Composition(None if behind is None else backend.floats(behind), None, view.unit)
+        )
+        image = backend.tensor(rendered.image.color, *truth.shape)
         residual = image - truth.to(image)
         if valid is not None:
             residual = residual * valid.to(residual.device)[..., None]

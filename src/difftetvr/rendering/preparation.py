@@ -14,7 +14,7 @@ from difftetvr.errors import DiffTetError, MeshError, shown
 from difftetvr.inputs import as_number, require_type
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.optics import ConstantPerCell, ExactLinear, OpticalModel
-from difftetvr.rendering.autograd import TRACERS, Content, RenderTask
+from difftetvr.rendering.autograd import TRACERS, Content, RenderTask, Shot
 from difftetvr.rendering.cameras.pinhole import Camera
 from difftetvr.rendering.clip_plane import clip_limits, clip_rays
 from difftetvr.rendering.kernels.layout import LARGEST
@@ -73,6 +73,11 @@ class PreparedView:
         """What crosses the mesh along the rays, between (N, 2) limits; None for all in front of their origins."""
         return self.task.tracer(self.upload, self.laid_out, limits, self.rays, self.parts)
 
+    def shot(self, limits: torch.Tensor | None) -> Shot:
+        """The view between (N, 2) limits, ready to be rendered."""
+        shift = None if self.bundle is None else self.task.backend.floats(self.bundle.shift)
+        return Shot(self.tracer(limits), self.rays.count, shift, self.unit)
+
     @property
     def lines(self) -> torch.Tensor | None:
         """(N, 6) origins and unit directions of the rays, in that unit; None where they are a camera's."""
@@ -90,14 +95,6 @@ class PreparedView:
                 return None
             return clip_limits(clip_plane, self.task.camera, like, origin).reshape(-1, 2) / self.unit
         return self.bundle.limits(clip_plane, origin, self.unit)
-
-    def world_distance(self, light: torch.Tensor, distance: torch.Tensor) -> torch.Tensor:
-        """(N,) integral of the distance from the rays' true origins, in world units, from a kernel's outputs."""
-        distance = distance if self.unit == 1.0 else distance * self.unit
-        if self.bundle is None:
-            return distance
-        alpha = -torch.expm1(-light[:, self.task.channels])
-        return distance + alpha * self.bundle.shift.to(distance)
 
 
 @dataclass(frozen=True)
@@ -248,7 +245,8 @@ def _checked(mesh: Any, field: Any, camera: Any, options: ViewOptions) -> ViewOp
     """Refuse arguments of the wrong kind, those first that come in batches elsewhere."""
     require_type(mesh, TetMesh, "mesh", "pass a difftetvr.TetMesh", DiffTetError)
     require_type(field, (Field, ScalarField), "field", "pass one difftetvr.Field or ScalarField", DiffTetError)
-    if isinstance(camera, type) or not isinstance(camera, (Rays, RaySource)):
+    # The protocol is slow to ask.
+    if type(camera) is not Camera and (isinstance(camera, type) or not isinstance(camera, (Rays, RaySource))):
         raise DiffTetError(f"camera is {shown(camera)}; {CAMERAS}.")
     optics, renderer = options.optics, options.renderer
     has_model = not isinstance(optics, type) and all(callable(getattr(optics, n, None)) for n in ("weights", "adjoint"))
@@ -326,7 +324,7 @@ def _is_blurred(extent: Extent, camera: Camera, vertices: torch.Tensor) -> bool:
         return False
     if _is_remote(extent):
         return True
-    shift = float(camera.world_to_camera.detach()[:3, 3].abs().max())
+    shift = max(abs(row[3]) for row in camera.world_to_camera.tolist())
     return shift > _REMOTE * max(abs(extent.low[2]), abs(extent.high[2]))
 
 

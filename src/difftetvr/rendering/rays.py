@@ -165,7 +165,7 @@ def image_order(shape: tuple[int, ...]) -> np.ndarray | None:
     if len(shape) < 2 or min(shape[-2:]) < _LEAST_SIDE:
         return None
     height, width = shape[-2:]
-    size: Any = _Size(np.uint32(width), np.uint32(height))
+    size: Any = _Size((width, height), np.uint32(width), np.uint32(height))
     column, row, valid = lane_pixel(size, np.arange(lane_count(width, height), dtype=np.uint32))
     one = (row * np.uint32(width) + column)[valid].astype(np.int64)
     images = np.arange(math.prod(shape[:-2]))[:, None] * (width * height)
@@ -177,5 +177,6 @@ _LEAST_SIDE = 4
 
 @dataclass(frozen=True)
 class _Size:
+    size: tuple[int, int]
     width: np.uint32
     height: np.uint32

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
-import torch
 
 from difftetvr.backend import Backend
 from difftetvr.mesh import TetMesh
@@ -100,10 +99,6 @@ class LaidOut:
     device_extent: Any
     extent: Extent
     entries: EntryLists | None
-
-    def positions(self, stride: int, count: int) -> torch.Tensor:
-        """(V, 3) vertices in the space of the rays and the order of memory."""
-        return self.records.torch().reshape(-1, 4 * stride)[:count, :3]
 
 
 def lay_out(upload: Upload) -> LaidOut:

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
-import torch
 
 from difftetvr.backend import Backend
 from difftetvr.rendering.traversal.rays import (
@@ -28,29 +27,23 @@ _NEAR_PLANE = 2.0**-8  # points nearer to the camera's plane, in units of their 
 
 @dataclass
 class PinholeRays:
-    """Intrinsics and image size as device values, so that a new view needs no recompilation; see `ImageRays`."""
+    """Intrinsics and image size in memory, so that a new view needs no recompilation; see `ImageRays`."""
 
     size: tuple[int, int]
-    inverse_fx: Any
-    inverse_fy: Any
-    fx: Any
-    fy: Any
-    cx: Any
-    cy: Any
-    width: Any
+    intrinsics: Any
+    width: Any  # values of their own, not gathered ones: 0 in masked lanes, which integer division does not survive
     height: Any
 
     @staticmethod
     def of(backend: Backend, camera: Camera) -> PinholeRays:
         """Upload a camera's intrinsics."""
-        values = [1.0 / camera.fx, 1.0 / camera.fy, camera.fx, camera.fy, camera.cx, camera.cy]
-        floats = backend.floats(torch.tensor(values, dtype=backend.dtype, device=backend.device))
-        sizes = backend.uints(torch.tensor([camera.width, camera.height], dtype=torch.int32, device=backend.device))
-        return PinholeRays(
-            (camera.width, camera.height),
-            *(dr.gather(backend.Float, floats, backend.UInt(i)) for i in range(6)),
-            *(dr.gather(backend.UInt, sizes, backend.UInt(i)) for i in range(2)),
-        )
+        values = [camera.fx, camera.fy, camera.cx, camera.cy, 1.0 / camera.fx, 1.0 / camera.fy]
+        width, height = (backend.opaque_uint(pixels) for pixels in (camera.width, camera.height))
+        return PinholeRays((camera.width, camera.height), backend.Float(values), width, height)
+
+    def _intrinsic(self, place: int) -> Any:
+        """fx, fy, cx, cy, 1 / fx or 1 / fy."""
+        return dr.gather(type(self.intrinsics), self.intrinsics, type(self.width)(place))
 
     @property
     def count(self) -> int:
@@ -74,9 +67,10 @@ class PinholeRays:
 
     def frame(self, column: Any, row: Any) -> Frame:
         """Frame of the ray through the centre of a pixel (Duff et al. 2017, branch-free because z > 0)."""
-        float_t = type(self.fx)
-        x = ((float_t(column) + 0.5) - self.cx) * self.inverse_fx
-        y = ((float_t(row) + 0.5) - self.cy) * self.inverse_fy
+        float_t = type(self.intrinsics)
+        cx, cy, inverse_fx, inverse_fy = (self._intrinsic(place) for place in (2, 3, 4, 5))
+        x = ((float_t(column) + 0.5) - cx) * inverse_fx
+        y = ((float_t(row) + 0.5) - cy) * inverse_fy
         z = 1.0 / dr.sqrt(dr.fma(x, x, dr.fma(y, y, float_t(1))))
         x, y = x * z, y * z
         inverse = -1.0 / (1.0 + z)
@@ -99,8 +93,8 @@ class PinholeRays:
         ahead = [point[2] > size * _NEAR_PLANE for point in points]
         box = []
         for axis, scale, center, pixels in (
-            (0, self.fx, self.cx, self.width),
-            (1, self.fy, self.cy, self.height),
+            (0, self._intrinsic(0), self._intrinsic(2), self.width),
+            (1, self._intrinsic(1), self._intrinsic(3), self.height),
         ):
             low, high = _projection(points, axis, ahead, size)
             last = real(pixels) - 1.0

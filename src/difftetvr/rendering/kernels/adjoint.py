@@ -17,6 +17,7 @@ from typing import Any
 import drjit as dr
 
 from difftetvr.recording import few_lengths, replayed
+from difftetvr.rendering.kernels.composition import Composition, Pixels, pixel_adjoint
 from difftetvr.rendering.traversal.crossing import (
     Clip,
     Span,
@@ -37,19 +38,19 @@ _EXPAND_BUDGET = 1 << 30  # bytes of per-thread gradient copies; beyond it threa
 
 @dataclass
 class ImageAdjoint:
-    """Flat derivatives of the loss with respect to the kernel's outputs, and those outputs.
+    """Derivatives of the loss with respect to an image, and what was gathered for it.
 
     Attributes:
-        light: (N, width) records, derivatives with respect to channels and optical depth.
-        distance: (N,) derivatives with respect to the integral of distance; None if they are all zero.
-        out_light: (N, width) records of channels and optical depth.
-        out_distance: (N,) integral of distance.
+        image: The derivatives; None for those that are all zero.
+        how: How the image was composed.
+        light: (N, width) records of channels and optical depth.
+        distance: (N,) integral of distance.
     """
 
+    image: Pixels
+    how: Composition
     light: Any
-    distance: Any | None
-    out_light: Any
-    out_distance: Any
+    distance: Any
 
 
 @dataclass
@@ -91,15 +92,6 @@ class AdjointRay:
     carry: list[Any]
     limits: list[Any]
     line: list[Any]
-
-
-@dataclass
-class PixelAdjoint:
-    """Derivatives of the loss with respect to one pixel; distance is None where the loss does not depend on it."""
-
-    color: list[Any]
-    optical_depth: Any
-    distance: Any | None
 
 
 def reduce_mode(view: View, floats: int) -> dr.ReduceMode:
@@ -175,14 +167,14 @@ class _AdjointKernel:
         self.view, self.gradients, self.rays = tracer.view, gradients, rays
         self.span = Span.of(tracer, rays)
         backend, pixel, valid = self.view.backend, rays.pixel, rays.valid
-        *light, optical_depth = self.view.records.gather(backend, image.light, pixel, valid)
-        *seen, _ = self.view.records.gather(backend, image.out_light, pixel, valid)
-        self.rest = sum((g * c for g, c in zip(light, seen, strict=True)), dr.zeros(backend.Float, dr.width(pixel)))
-        self.pixel = PixelAdjoint(light, optical_depth, None)
-        if image.distance is not None:
-            self.pixel.distance = dr.gather(backend.Float, image.distance, pixel, valid)
-            far = dr.gather(backend.Float, image.out_distance, pixel, valid)
-            self.rest = dr.fma(self.pixel.distance, far, self.rest)
+        *seen, optical_depth = self.view.records.gather(backend, image.light, pixel, valid)
+        distance = dr.gather(backend.Float, image.distance, pixel, valid)
+        gathered = optical_depth, distance
+        self.pixel = pixel_adjoint(image.image, image.how, self.view.channels, gathered, pixel, valid)
+        pairs = zip(self.pixel.color, seen, strict=True)
+        self.rest = sum((g * c for g, c in pairs), dr.zeros(backend.Float, dr.width(pixel)))
+        if self.pixel.distance is not None:
+            self.rest = dr.fma(self.pixel.distance, distance, self.rest)
         # Accumulators of a vertex: its scalar, or density and radiance, then its position in the ray's frame; for
         # fields on cells only the position.
         self.field_slots = 0 if self.view.cells is not None else 2 if self.view.has_vertex_channels else 1

@@ -12,6 +12,7 @@ from typing import Any
 import drjit as dr
 
 from difftetvr.recording import replayed
+from difftetvr.rendering.kernels.composition import Composition, Pixels
 from difftetvr.rendering.traversal.crossing import (
     Span,
     Step,
@@ -43,29 +44,42 @@ class Radiance:
     carry: list[Any]
 
 
-def render_forward(tracer: Tracer) -> tuple[Any, Any]:
-    """Render a view.
+@dataclass
+class Rendered:
+    """What a view's rays gather, as flat arrays, and the image of it.
 
-    Returns:
-        Flat arrays: (N, width) records of premultiplied radiance and optical depth, (N,) integral of the distance.
+    Attributes:
+        light: (N, width) records of premultiplied radiance and optical depth.
+        distance: (N,) integral of the distance at which light is absorbed.
+        image: The image.
     """
-    light, distance = replayed(_forward, tracer, tracer.view.rays.count)
-    return light, distance
+
+    light: Any
+    distance: Any
+    image: Pixels
 
 
-def _forward(tracer: Tracer, count: int) -> tuple[Any, Any]:
-    real, width = tracer.view.backend.Float, tracer.view.records.width
-    light, distance = dr.empty(real, width * count), dr.empty(real, count)
-    tracer.trace(lambda rays: _ForwardKernel(tracer, rays, light, distance))
-    dr.eval(light, distance)
-    return light, distance
+def render_forward(tracer: Tracer, how: Composition) -> Rendered:
+    """Render a view."""
+    rendered: Rendered = replayed(_forward, tracer, how, tracer.view.rays.count)
+    return rendered
+
+
+def _forward(tracer: Tracer, how: Composition, count: int) -> Rendered:
+    view = tracer.view
+    real = view.backend.Float
+    light, distance = dr.empty(real, view.records.width * count), dr.empty(real, count)
+    rendered = Rendered(light, distance, Pixels.empty(real, view.channels, count))
+    tracer.trace(lambda rays: _ForwardKernel(tracer, rays, rendered, how))
+    dr.eval(rendered)
+    return rendered
 
 
 class _ForwardKernel:
     """Gathers light; see :class:`difftetvr.rendering.traversal.crossing.Kernel`."""
 
-    def __init__(self, tracer: Tracer, rays: Lanes, light: Any, distance: Any) -> None:
-        self.view, self.rays, self.light, self.distance = tracer.view, rays, light, distance
+    def __init__(self, tracer: Tracer, rays: Lanes, rendered: Rendered, how: Composition) -> None:
+        self.view, self.rays, self.rendered, self.how = tracer.view, rays, rendered, how
         self.span = Span.of(tracer, rays)
         self.slots = 1 if self.view.has_vertex_channels else 0
 
@@ -143,9 +157,10 @@ class _ForwardKernel:
         return Radiance(channels, ray.distance, ray.optical_depth, ray.transmittance, carry)
 
     def finish(self, ray: Radiance) -> None:
-        view, pixel, valid = self.view, self.rays.pixel, self.rays.valid
-        view.records.scatter(view.backend, self.light, [*ray.channels, ray.optical_depth], pixel, valid)
-        dr.scatter(self.distance, ray.distance, pixel, valid)
+        view, pixel, valid, rendered = self.view, self.rays.pixel, self.rays.valid, self.rendered
+        view.records.scatter(view.backend, rendered.light, [*ray.channels, ray.optical_depth], pixel, valid)
+        dr.scatter(rendered.distance, ray.distance, pixel, valid)
+        rendered.image.write(self.how, ray.channels, ray.distance, ray.optical_depth, pixel, valid)
 
 
 def _distribute(face: Face, weight: Any) -> None:

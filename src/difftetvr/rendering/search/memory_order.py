@@ -92,16 +92,26 @@ class OrderedMesh:
     """A mesh in the order of memory, seen from where rays are.
 
     Attributes:
+        backend: Array types.
         order: The order.
         tables: What kernels read of the topology.
-        positions: (V, 3) vertices in the space of the rays.
+        records: Flat records of vertices, which begin with x, y and z in the space of the rays.
+        stride: Packets of four floats a record.
         extent: Greatest of x, -x, y, -y, z and -z among them, and two numbers more; on the device.
     """
 
+    backend: Backend
     order: MemoryOrder
     tables: MeshTables
-    positions: torch.Tensor
+    records: Any
+    stride: int
     extent: Any
+
+    @property
+    def positions(self) -> torch.Tensor:
+        """(V, 3) vertices in the space of the rays."""
+        rows = self.backend.tensor(self.records, -1, 4 * self.stride)
+        return rows[: self.order.topology.num_vertices, :3]
 
 
 def _ordered(mesh: TetMesh) -> MemoryOrder:

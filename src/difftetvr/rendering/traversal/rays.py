@@ -14,7 +14,7 @@ import drjit as dr
 
 from difftetvr.backend import Backend
 
-_BLOCK_BITS = 6  # pixels are visited in Morton order inside blocks of 64 x 64
+_MOST_BLOCK_BITS = 6  # pixels are visited in Morton order inside blocks of 64 x 64, smaller ones in small images
 
 
 @dataclass
@@ -92,13 +92,16 @@ class KernelRays(Protocol):
 class ImageRays(KernelRays, Protocol):
     """Rays of a camera, from the origin through the pixels of an image.
 
-    Attributes hold the image's size in pixels, ``size`` on the host: (width, height). A camera model that can be
-    rasterised is a camera and one of these beside it.
+    A camera model that can be rasterised is a camera and one of these beside it.
+
+    Attributes:
+        size: Width and height of the image in pixels.
+        width, height: The same as device values.
     """
 
+    size: tuple[int, int]
     width: Any
     height: Any
-    size: tuple[int, int]
 
     def frame(self, column: Any, row: Any) -> Frame:
         """Frame of the ray of a pixel."""
@@ -127,30 +130,37 @@ def rounding_of(size: Any) -> Any:
     return 16.0 * dr.epsilon(size) * size
 
 
+def _block_bits(size: tuple[int, int]) -> int:
+    """Binary logarithm of the side of a block in an image of some width and height."""
+    return min((max(size) - 1).bit_length(), _MOST_BLOCK_BITS)
+
+
 def lane_count(width: int, height: int) -> int:
     """Number of kernel lanes for an image: its size rounded up to whole blocks."""
-    block = 1 << _BLOCK_BITS
+    block = 1 << _block_bits((width, height))
     return -(-width // block) * -(-height // block) * block * block
 
 
 def lane_pixel(image: ImageRays, lane: Any) -> tuple[Any, Any, Any]:
     """Column, row and validity of a lane: neighbouring lanes see neighbouring pixels, so rays share cells in cache."""
-    mask = (1 << _BLOCK_BITS) - 1
-    blocks_per_row = (image.width + mask) >> _BLOCK_BITS
-    block = lane >> (2 * _BLOCK_BITS)
+    bits = _block_bits(image.size)
+    mask = (1 << bits) - 1
+    blocks_per_row = (image.width + mask) >> bits
+    block = lane >> (2 * bits)
     block_row = block // blocks_per_row
     block_column = block - block_row * blocks_per_row
-    column = (block_column << _BLOCK_BITS) + _even_bits(lane)
-    row = (block_row << _BLOCK_BITS) + _even_bits(lane >> 1)
+    column = (block_column << bits) + (_even_bits(lane) & mask)
+    row = (block_row << bits) + (_even_bits(lane >> 1) & mask)
     return column, row, (column < image.width) & (row < image.height)
 
 
 def pixel_lane(image: ImageRays, column: Any, row: Any) -> Any:
     """The lane of a pixel: the inverse of :func:`lane_pixel`."""
-    mask = (1 << _BLOCK_BITS) - 1
-    blocks_per_row = (image.width + mask) >> _BLOCK_BITS
-    block = (row >> _BLOCK_BITS) * blocks_per_row + (column >> _BLOCK_BITS)
-    return (block << (2 * _BLOCK_BITS)) + _spread_bits(column & mask) + (_spread_bits(row & mask) << 1)
+    bits = _block_bits(image.size)
+    mask = (1 << bits) - 1
+    blocks_per_row = (image.width + mask) >> bits
+    block = (row >> bits) * blocks_per_row + (column >> bits)
+    return (block << (2 * bits)) + _spread_bits(column & mask) + (_spread_bits(row & mask) << 1)
 
 
 def _spread_bits(code: Any) -> Any:

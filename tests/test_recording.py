@@ -1,0 +1,111 @@
+"""Recorded kernels: results as of traced ones, and nothing traced or compiled for what differs in arrays alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import pytest
+import torch
+
+from difftetvr.backend import Backend, get_backend
+from difftetvr.mesh import Field, TetMesh
+from difftetvr.mesh.changes.bisection import bisect_edges
+from difftetvr.mesh.changes.collapse import collapse_edges
+from difftetvr.recording import few_lengths, replayed
+from difftetvr.rendering import Camera, render
+
+
+@dataclass
+class Line:
+    """Coefficients of a straight line, one for all lanes or one each, and whether to go up it or down."""
+
+    backend: Backend
+    slope: Any
+    offset: Any
+    is_rising: bool
+
+
+def at(line: Line, places: list[Any], traces: Callable[[], None] | None = None) -> tuple[Any, Any]:
+    rise = line.slope * places[0]
+    value = line.offset + rise if line.is_rising else line.offset - rise
+    dr.eval(value)
+    return value, line.backend.Float(2) * value
+
+
+def test_replays_give_what_traces_give() -> None:
+    backend = get_backend("cpu", torch.float64)
+    for seed, count in ((0, 50), (1, 50), (2, 7), (3, 4000)):
+        slope, offset, x = torch.rand(3, count, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+        for is_rising in (True, False):
+            line = Line(backend, backend.floats(slope), backend.floats(offset), is_rising)
+            value, twice = replayed(at, line, [backend.floats(x)])
+            expected = offset + slope * x if is_rising else offset - slope * x
+            assert torch.allclose(backend.tensor(value), expected, rtol=1e-15)
+            assert torch.allclose(backend.tensor(twice), 2 * expected, rtol=1e-15)
+
+
+def test_what_may_hold_anything_is_called_as_it_is() -> None:
+    backend, calls = get_backend("cpu"), []
+
+    def double(x: Any, note: Any) -> Any:
+        calls.append(note)
+        return 2.0 * x
+
+    for k in range(3):
+        note = [object()]  # no plain value: a model of the user's, for example
+        assert replayed(double, backend.Float([float(k)]), note)[0] == 2.0 * k
+    assert len(calls) == 3
+
+
+def test_lengths_are_few_and_long_enough() -> None:
+    lengths = {few_lengths(count) for count in range(1, 1 << 12)}
+    assert all(count <= few_lengths(count) <= 1.25 * count + 1 for count in range(1 << 12))
+    assert len(lengths) <= 4 * 12 + 1
+
+
+def launches(run: Callable[[], object]) -> tuple[int, int, int]:
+    """How many kernels a function has launched, how many of them it has traced, and how many compiled."""
+    dr.kernel_history_clear()
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        run()
+    kernels = [entry for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT]
+    assert kernels
+    replays = sum(entry["recording_mode"] == dr.KernelRecordingMode.Replayed for entry in kernels)
+    return len(kernels), len(kernels) - replays, sum(not entry["cache_hit"] for entry in kernels)
+
+
+def exchanged(mesh: TetMesh, seed: int) -> TetMesh:
+    """A mesh with some edges halved and others collapsed."""
+    generator = torch.Generator().manual_seed(seed)
+    mesh = bisect_edges(mesh, torch.randperm(len(mesh.topology.edges), generator=generator)[:12]).mesh
+    edges = torch.randperm(len(mesh.topology.edges), generator=generator)
+    cost = torch.rand(len(edges), generator=generator)
+    return collapse_edges(mesh, edges, torch.zeros_like(edges), cost, limit=60).mesh
+
+
+@pytest.mark.parametrize("eye", [(2.5, 2.0, 1.5), (0.1, 0.05, 0.2)], ids=["outside", "inside"])
+def test_exchanges_of_cells_compile_nothing(eye: tuple[float, float, float]) -> None:
+    mesh = TetMesh.grid((6, 6, 6), (-1, -1, -1), (1, 1, 1))
+    camera = Camera.look_at(eye, (0, 0, 0), width=24, height=16)
+
+    def iterate(mesh: TetMesh) -> None:
+        values = torch.rand(mesh.num_vertices, 4, generator=torch.Generator().manual_seed(mesh.num_vertices))
+        values.requires_grad_()
+        vertices = mesh.vertices.clone().requires_grad_()
+        image = render(mesh.with_vertices(vertices), Field(values[:, :3], values[:, 3]), camera)
+        image.color.square().sum().backward()
+        assert values.grad is not None and bool(vertices.grad.any())
+
+    iterate(mesh)
+    sizes, launched, traced, compiled = set(), 0, 0, 0
+    for seed in range(40):
+        mesh = exchanged(mesh, seed)
+        sizes.add((mesh.num_vertices, mesh.num_cells))
+        new = launches(lambda mesh=mesh: iterate(mesh))
+        launched, traced, compiled = launched + new[0], traced + new[1], compiled + new[2]
+    assert len(sizes) > 30
+    # The sizes pass a few of the lengths that buffers have; only then anything is traced.
+    assert compiled <= 10 and traced < 0.25 * launched, (compiled, traced, launched)
