@@ -40,6 +40,7 @@ from .rendering.cameras.lens import LensCamera as LensCamera
 from .rendering.cameras.panoramic import PanoramicCamera as PanoramicCamera
 from .rendering.cameras.parallel import ParallelCamera as ParallelCamera
 from .rendering.cameras.pinhole import Camera as Camera
+from .rendering.cell_features import CellFeatures as CellFeatures
 from .rendering.rays import Rays as Rays
 from .rendering.rays import RaySource as RaySource
 from .rendering.scalar_field import ScalarField as ScalarField
@@ -54,6 +55,7 @@ __all__ = [
     "CameraError",
     "Capture",
     "CaptureError",
+    "CellFeatures",
     "Detector",
     "DiffTetError",
     "Field",

@@ -73,6 +73,7 @@ def render_oracle(
     background: Tensor | None = None,
     per_cell: bool = False,
     nudge: tuple[float, float] = (0.0, 0.0),
+    color_per_cell: bool = False,
 ) -> OracleImage:
     """Render by brute force in float64.
 
@@ -87,6 +88,7 @@ def render_oracle(
         background: (3,) radiance behind the mesh, black if None.
         per_cell: Whether colour and density are constant in each cell.
         nudge: Offset added to the x and y components of all ray directions at z = 1.
+        color_per_cell: Whether colour alone is constant in each cell.
     """
     pose = camera.world_to_camera.to(torch.float64)
     points = vertices.to(torch.float64) @ pose[:3, :3].T + pose[:3, 3]
@@ -94,9 +96,9 @@ def render_oracle(
     offset, slope = barycentric_functions(points[tets.long()])
     crossings = find_crossings(offset.detach(), slope.detach(), directions)
     shape = (camera.height, camera.width)
-    return _integrate(
-        offset, slope, directions, crossings, _cell_values(tets, color, density, per_cell), background, shape
-    )
+    colors = _cell_values(tets, color, per_cell or color_per_cell)
+    values = torch.cat([colors, _cell_values(tets, density[:, None], per_cell)], dim=-1)
+    return _integrate(offset, slope, directions, crossings, values, background, shape)
 
 
 def pixel_directions(camera: Camera, nudge: tuple[float, float] = (0.0, 0.0)) -> Tensor:
@@ -163,10 +165,10 @@ def quadrature(optical_depth: float) -> tuple[Tensor, Tensor]:
     return torch.from_numpy(nodes.ravel()), torch.from_numpy((lengths * 0.5 * w).ravel())
 
 
-def _cell_values(tets: Tensor, color: Tensor, density: Tensor, per_cell: bool) -> Tensor:
-    """(T, 4, 4) red, green, blue and density at the four corners of each cell."""
-    values = torch.cat([color.to(torch.float64), density.to(torch.float64)[:, None]], dim=-1)
-    return values[:, None].expand(-1, 4, -1) if per_cell else values[tets.long()]
+def _cell_values(tets: Tensor, values: Tensor, per_cell: bool) -> Tensor:
+    """(T, 4, C) values at the four corners of each cell."""
+    exact = values.to(torch.float64)
+    return exact[:, None].expand(-1, 4, -1) if per_cell else exact[tets.long()]
 
 
 def _integrate(

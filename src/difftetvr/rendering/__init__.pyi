@@ -1,6 +1,7 @@
 from . import api as api
 from . import autograd as autograd
 from . import cameras as cameras
+from . import cell_features as cell_features
 from . import clip_plane as clip_plane
 from . import gauss_newton as gauss_newton
 from . import inspection as inspection
@@ -18,6 +19,7 @@ from .cameras.lens import LensCamera as LensCamera
 from .cameras.panoramic import PanoramicCamera as PanoramicCamera
 from .cameras.parallel import ParallelCamera as ParallelCamera
 from .cameras.pinhole import Camera as Camera
+from .cell_features import CellFeatures as CellFeatures
 from .rays import Rays as Rays
 from .rays import RaySource as RaySource
 from .scalar_field import ScalarField as ScalarField
@@ -25,6 +27,7 @@ from .tracers.projected import OrderWarning as OrderWarning
 
 __all__ = [
     "Camera",
+    "CellFeatures",
     "Detector",
     "LensCamera",
     "OrderWarning",

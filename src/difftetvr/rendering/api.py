@@ -15,6 +15,7 @@ from difftetvr.inputs import as_reals
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.optics import OpticalModel
 from difftetvr.rendering.autograd import RenderFunction
+from difftetvr.rendering.cell_features import CellFeatures
 from difftetvr.rendering.preparation import PreparedView, ViewOptions, prepare_view
 from difftetvr.rendering.rays import Rays, RaySource
 from difftetvr.rendering.scalar_field import ScalarField
@@ -52,7 +53,7 @@ class RenderedImage:
 @overload
 def render(
     mesh: TetMesh,
-    field: Field | ScalarField,
+    field: Field | ScalarField | CellFeatures,
     camera: RaySource | Rays,
     background: torch.Tensor | tuple[float, ...] | None = None,
     renderer: str = "marching",
@@ -66,7 +67,7 @@ def render(
 @overload
 def render(
     mesh: TetMesh,
-    field: Field | ScalarField,
+    field: Field | ScalarField | CellFeatures,
     camera: Sequence[RaySource],
     background: torch.Tensor | tuple[float, ...] | None = None,
     renderer: str = "marching",
@@ -80,7 +81,7 @@ def render(
 @eager
 def render(
     mesh: TetMesh,
-    field: Field | ScalarField,
+    field: Field | ScalarField | CellFeatures,
     camera: RaySource | Rays | Sequence[RaySource],
     background: torch.Tensor | tuple[float, ...] | None = None,
     renderer: str = "marching",
@@ -98,7 +99,7 @@ def render(
     Args:
         mesh: Tetrahedral mesh; its vertices' device and dtype (float32 or float64) decide where and how to render.
         field: Channels and density per vertex (linear inside each cell) or per cell (constant); or scalars likewise,
-            with a transfer function.
+            with a transfer function; or channels per cell over the density of either (`CellFeatures`).
         camera: A camera, inside or outside of the mesh; any bundle of rays; or cameras, which are rendered together.
         background: (C,) channels behind the volume, linear RGB for colours; 0 if None.
         renderer: How crossings are found and ordered. ``"marching"`` walks from cell to cell; ``"linked-list"`` sorts
@@ -160,7 +161,7 @@ def _together(images: Sequence[RenderedImage]) -> RenderedImage | tuple[Rendered
 
 def _render(
     mesh: TetMesh,
-    field: Field | ScalarField,
+    field: Field | ScalarField | CellFeatures,
     camera: RaySource | Rays,
     background: torch.Tensor | tuple[float, ...] | None,
     options: ViewOptions,

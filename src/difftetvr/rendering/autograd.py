@@ -13,8 +13,9 @@ from difftetvr.backend import Backend
 from difftetvr.mesh import TetMesh
 from difftetvr.optics import OpticalModel
 from difftetvr.rendering.cameras.pinhole import Camera
-from difftetvr.rendering.kernels.adjoint import ImageAdjoint, Wanted, render_adjoint
+from difftetvr.rendering.kernels.adjoint import ImageAdjoint, render_adjoint
 from difftetvr.rendering.kernels.forward import render_forward
+from difftetvr.rendering.kernels.gradients import Gradients, Wanted
 from difftetvr.rendering.tracers.linked_list import LinkedList
 from difftetvr.rendering.tracers.marching import Marching
 from difftetvr.rendering.tracers.projected import Projected
@@ -26,7 +27,8 @@ from difftetvr.rendering.traversal.transfer import Transfer
 
 Content = Literal["vertex", "cell", "scalar"]
 """What a volume holds: (V, C) channels and (V,) densities on vertices, (T, C) and (T,) on cells, or (V,) scalars, (K,)
-knots and (K, 4) densities and colours of their transfer function."""
+knots and (K, 4) densities and colours of their transfer function. Features are (T, C) channels of cells: they come
+before these, instead of the channels of vertices or of the transfer function."""
 
 TRACERS: dict[str, Any] = {"marching": Marching, "linked-list": LinkedList, "projected": Projected}
 """How crossings are found and ordered, by the name of the renderer."""
@@ -47,6 +49,7 @@ class RenderTask:
         threshold: Transmittance at or below which rays stop.
         deterministic: Whether sums over rays have a fixed order.
         renderer: How crossings are found.
+        has_features: Whether channels are those of cells, while the density is not.
     """
 
     backend: Backend
@@ -59,6 +62,7 @@ class RenderTask:
     threshold: float
     deterministic: bool
     renderer: str = "marching"
+    has_features: bool = False
 
     def tracer(
         self,
@@ -77,7 +81,13 @@ class RenderTask:
         """
         backend = self.backend
         cells = transfer = None
-        if self.content == "vertex":
+        if self.has_features:
+            features, *parts = parts
+            if self.channels:
+                cells = backend.floats(Records(self.channels).pack(features, features.new_zeros(len(features))))
+        if self.content == "vertex" and self.has_features:
+            records = _with_fourth(backend, vertices, parts[0])
+        elif self.content == "vertex":
             color, density = (backend.floats(part) for part in parts)
             records = vertex_records(backend, backend.floats(vertices), density, color, self.channels)
         elif self.content == "cell":
@@ -95,6 +105,7 @@ class RenderTask:
             self.channels,
             records,
             cells,
+            self.content == "cell",
             transfer,
             backend.opaque(self.threshold),
             None if limits is None else backend.floats(limits),
@@ -129,7 +140,6 @@ class RenderFunction(torch.autograd.Function):
             image = task.backend.tensor(light, -1, tracer.view.records.width), task.backend.tensor(distance)
         ctx.set_materialize_grads(False)
         ctx.task, ctx.tracer = task, tracer
-        ctx.vertex_count, ctx.part_size = vertices.shape[0], parts[0].shape[0]
         ctx.save_for_backward(*image)
         return image
 
@@ -147,19 +157,30 @@ class RenderFunction(torch.autograd.Function):
                 backend.floats(light),
                 backend.floats(distance),
             )
-            gradients = render_adjoint(ctx.tracer, image, ctx.vertex_count, wanted)
-            vertices = (
-                backend.tensor(gradients.vertices).reshape(-1, 4)[: ctx.vertex_count, :3] if wanted.vertices else None
-            )
-            limits = backend.tensor(gradients.limits, -1, 2) if wanted.limits else None
-            lines = backend.tensor(gradients.lines, -1, 6) if wanted.lines else None
-            field = backend.tensor(gradients.field)
-            parts: tuple[torch.Tensor, ...]
-            if gradients.transfer is None:
-                records = ctx.tracer.view.records
-                parts = records.unpack(field.reshape(-1, records.width)[: ctx.part_size])
-            else:
-                values = backend.tensor(gradients.transfer.values).reshape(-1, 4)
-                parts = field[: ctx.part_size], backend.tensor(gradients.transfer.knots), values
+            gradients = render_adjoint(ctx.tracer, image, ctx.task.mesh.num_vertices, wanted)
+            geometry, parts = gradient_tensors(ctx.task, gradients)
         asked = (part if needed else None for part, needed in zip(parts, ctx.needs_input_grad[4:], strict=True))
-        return None, vertices, limits, lines, *asked
+        return None, *geometry, *asked
+
+
+def gradient_tensors(
+    task: RenderTask, gradients: Gradients
+) -> tuple[tuple[torch.Tensor | None, ...], list[torch.Tensor | None]]:
+    """Derivatives by vertices, limits and lines, None for those not wanted, and by all parts of the content."""
+    backend, records, count = task.backend, Records(task.channels), task.mesh.num_vertices
+    vertices = None if gradients.vertices is None else backend.tensor(gradients.vertices, -1, 4)[:count, :3]
+    limits = None if gradients.limits is None else backend.tensor(gradients.limits, -1, 2)
+    lines = None if gradients.lines is None else backend.tensor(gradients.lines, -1, 6)
+    parts: list[torch.Tensor | None] = []
+    if gradients.cells is not None:
+        parts += records.unpack(backend.tensor(gradients.cells, -1, records.width)[: task.mesh.num_cells])
+    if task.has_features:
+        parts = parts[:1] or [None]
+    if task.content == "vertex" and not task.has_features:
+        parts += records.unpack(backend.tensor(gradients.field, -1, records.width)[:count])
+    elif task.content != "cell":
+        parts.append(backend.tensor(gradients.field)[:count])
+    if gradients.transfer is not None:
+        transfer = gradients.transfer
+        parts += [backend.tensor(transfer.knots), backend.tensor(transfer.values, -1, 4)]
+    return (vertices, limits, lines), parts

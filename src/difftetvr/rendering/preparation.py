@@ -16,6 +16,7 @@ from difftetvr.mesh import Field, TetMesh
 from difftetvr.optics import ConstantPerCell, ExactLinear, OpticalModel
 from difftetvr.rendering.autograd import TRACERS, Content, RenderTask
 from difftetvr.rendering.cameras.pinhole import Camera
+from difftetvr.rendering.cell_features import CellFeatures
 from difftetvr.rendering.clip_plane import clip_limits, clip_rays
 from difftetvr.rendering.rays import Rays, RaySource, image_order
 from difftetvr.rendering.scalar_field import ScalarField
@@ -135,7 +136,7 @@ class PreparedRays:
 
 
 def prepare_view(
-    mesh: TetMesh, field: Field | ScalarField, camera: RaySource | Rays, options: ViewOptions
+    mesh: TetMesh, field: Field | ScalarField | CellFeatures, camera: RaySource | Rays, options: ViewOptions
 ) -> PreparedView:
     """Check a view's inputs and bring them to kernels; arguments and errors are those of :func:`difftetvr.render`."""
     options = _checked(mesh, field, camera, options)
@@ -159,8 +160,10 @@ def prepare_view(
         bundle = PreparedRays.of(source, mesh)
     backend = backend_for(positions)
     parts = tuple(part.to(backend.dtype) for part in parts)
+    has_features = isinstance(field, CellFeatures) and content != "cell"
     if content != "scalar":
-        Field(parts[0], parts[1], content).validate(mesh)
+        color = parts[1].new_zeros(len(parts[1]), 0) if has_features else parts[0]
+        Field(color, parts[1], content).validate(mesh)
     optics = options.optics or (ConstantPerCell() if content == "cell" else ExactLinear())
     vertices, unit = _unit_of_length(positions, mesh)
     task = RenderTask(
@@ -170,10 +173,11 @@ def prepare_view(
         order,
         optics,
         content,
-        3 if content == "scalar" else parts[0].shape[1],
+        3 if content == "scalar" and not has_features else parts[0].shape[1],
         options.transmittance_threshold,
         options.deterministic,
         options.renderer,
+        has_features,
     )
     if bundle is not None:
         bundle = _in_unit(bundle, unit, backend)
@@ -183,7 +187,8 @@ def prepare_view(
 def _checked(mesh: Any, field: Any, camera: Any, options: ViewOptions) -> ViewOptions:
     """Refuse arguments of the wrong kind, those first that come in batches elsewhere."""
     require_type(mesh, TetMesh, "mesh", "pass a difftetvr.TetMesh", DiffTetError)
-    require_type(field, (Field, ScalarField), "field", "pass one difftetvr.Field or ScalarField", DiffTetError)
+    fields = (Field, ScalarField, CellFeatures)
+    require_type(field, fields, "field", "pass one difftetvr.Field, ScalarField or CellFeatures", DiffTetError)
     if isinstance(camera, type) or not isinstance(camera, (Rays, RaySource)):
         raise DiffTetError(f"camera is {shown(camera)}; {CAMERAS}.")
     optics, renderer = options.optics, options.renderer
@@ -215,10 +220,13 @@ def as_rays(camera: RaySource | Rays) -> Rays:
 
 
 def _content(
-    mesh: TetMesh, field: Field | ScalarField, camera: Camera | Rays
+    mesh: TetMesh, field: Field | ScalarField | CellFeatures, camera: Camera | Rays
 ) -> tuple[Content, tuple[torch.Tensor, ...]]:
     """What the volume holds, and its tensors as they are."""
     location = field.location_on(mesh)
+    if isinstance(field, CellFeatures):
+        content, medium = _content(mesh, field.without_colours(), camera)
+        return content, (field.features, *(medium if content == "scalar" else medium[1:]))
     if isinstance(field, ScalarField):
         if location == "vertex":
             return "scalar", (field.normalised(), *field.knots(mesh.vertices))
@@ -291,7 +299,7 @@ def _parts_by_unit(content: Content, parts: tuple[torch.Tensor, ...], unit: floa
     if unit == 1.0:
         return parts
     if content == "scalar":
-        return (*parts[:2], torch.cat((_by_unit(parts[2][:, :1], unit), parts[2][:, 1:]), dim=1))
+        return (*parts[:-1], torch.cat((_by_unit(parts[-1][:, :1], unit), parts[-1][:, 1:]), dim=1))
     return parts[0], _by_unit(parts[1], unit)
 
 

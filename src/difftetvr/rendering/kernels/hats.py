@@ -25,7 +25,7 @@ import torch
 from difftetvr.mesh import TetMesh
 from difftetvr.mesh.topology.incidence import cell_edges, cell_faces
 from difftetvr.mesh.topology.topology import LOCAL_EDGE_OF, LOCAL_EDGES
-from difftetvr.rendering.kernels.adjoint import buffer_length, reduce_mode
+from difftetvr.rendering.kernels.gradients import buffer_length, reduce_mode
 from difftetvr.rendering.traversal.crossing import (
     Span,
     Step,
