@@ -199,13 +199,17 @@ class Span:
         return Span(view.backend.Float(0), None) if tracer.starts_inside else None
 
     def clip(self, t0: Any, t1: Any) -> Clip:
-        """The part of a crossing from t0 to t1 that lies in the span."""
+        """The part of a crossing from t0 to t1 that lies in the span.
+
+        An end of the span that is exactly at a face decides there, and does so in one of the face's cells alone.
+        """
         inverse = inverse_length(t0, t1)
-        at_near = t0 < self.near
+        at_near = t0 <= self.near
         first = dr.select(at_near, dr.fmin((self.near - t0) * inverse, 1.0), 0.0)
+        first = dr.select(t1 <= self.near, 1.0, first)
         if self.far is None:
             return Clip(first, type(first)(1), at_near, dr.zeros(dr.mask_t(first)))
-        at_far = t1 > self.far
+        at_far = t1 >= self.far
         last = dr.select(at_far, dr.fmax((self.far - t0) * inverse, 0.0), 1.0)
         return Clip(first, dr.fmax(last, first), at_near, at_far)
 
