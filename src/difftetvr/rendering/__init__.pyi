@@ -7,6 +7,7 @@ from . import gauss_newton as gauss_newton
 from . import inspection as inspection
 from . import kernels as kernels
 from . import preparation as preparation
+from . import quantities as quantities
 from . import rays as rays
 from . import scalar_field as scalar_field
 from . import search as search
@@ -20,6 +21,9 @@ from .cameras.panoramic import PanoramicCamera as PanoramicCamera
 from .cameras.parallel import ParallelCamera as ParallelCamera
 from .cameras.pinhole import Camera as Camera
 from .cell_features import CellFeatures as CellFeatures
+from .quantities.along_rays import depth_at as depth_at
+from .quantities.along_rays import transmittance_at as transmittance_at
+from .quantities.normals import render_normals as render_normals
 from .rays import Rays as Rays
 from .rays import RaySource as RaySource
 from .scalar_field import ScalarField as ScalarField
@@ -37,5 +41,8 @@ __all__ = [
     "Rays",
     "RenderedImage",
     "ScalarField",
+    "depth_at",
     "render",
+    "render_normals",
+    "transmittance_at",
 ]

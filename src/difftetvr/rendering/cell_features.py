@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import torch
 
-from difftetvr.errors import MeshError, counted, shown
+from difftetvr.errors import DiffTetError, MeshError, counted, shown
 from difftetvr.inputs import as_reals, moved, require_type
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.mesh.field import MOST_CHANNELS, Location
@@ -79,7 +79,19 @@ class CellFeatures:
         return dataclasses.replace(self, features=features, medium=self.medium.to(device, dtype))
 
 
-def medium_of(mesh: TetMesh, field: Field | ScalarField) -> CellFeatures:
-    """A field's density alone, without anything to be seen."""
-    require_type(field, (Field, ScalarField), "field", "pass one difftetvr.Field or ScalarField", MeshError)
-    return CellFeatures(mesh.vertices.new_zeros(mesh.num_cells, 0), field)
+def medium_of(mesh: TetMesh, field: Field | ScalarField | CellFeatures) -> CellFeatures:
+    """What absorbs of a field, without anything to be seen.
+
+    Raises:
+        DiffTetError: These are no mesh and no field.
+    """
+    require_type(mesh, TetMesh, "mesh", "pass a difftetvr.TetMesh", DiffTetError)
+    medium = field.medium if isinstance(field, CellFeatures) else field
+    require_type(
+        medium,
+        (Field, ScalarField),
+        "field",
+        "pass one difftetvr.Field, ScalarField or CellFeatures",
+        DiffTetError,
+    )
+    return CellFeatures(mesh.vertices.new_zeros(mesh.num_cells, 0), medium)
