@@ -40,6 +40,10 @@ from .rendering.cameras.lens import LensCamera as LensCamera
 from .rendering.cameras.panoramic import PanoramicCamera as PanoramicCamera
 from .rendering.cameras.parallel import ParallelCamera as ParallelCamera
 from .rendering.cameras.pinhole import Camera as Camera
+from .rendering.cell_features import CellFeatures as CellFeatures
+from .rendering.quantities.along_rays import depth_at as depth_at
+from .rendering.quantities.along_rays import transmittance_at as transmittance_at
+from .rendering.quantities.normals import render_normals as render_normals
 from .rendering.rays import Rays as Rays
 from .rendering.rays import RaySource as RaySource
 from .rendering.scalar_field import ScalarField as ScalarField
@@ -54,6 +58,7 @@ __all__ = [
     "CameraError",
     "Capture",
     "CaptureError",
+    "CellFeatures",
     "Detector",
     "DiffTetError",
     "Field",
@@ -75,6 +80,7 @@ __all__ = [
     "Volume",
     "VolumeCapture",
     "__version__",
+    "depth_at",
     "fit",
     "isosurface",
     "load",
@@ -83,7 +89,9 @@ __all__ = [
     "load_mesh",
     "probe",
     "render",
+    "render_normals",
     "save",
+    "transmittance_at",
     "trusting",
     "voxelise",
 ]

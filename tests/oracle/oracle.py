@@ -73,6 +73,7 @@ def render_oracle(
     background: Tensor | None = None,
     per_cell: bool = False,
     nudge: tuple[float, float] = (0.0, 0.0),
+    color_per_cell: bool = False,
 ) -> OracleImage:
     """Render by brute force in float64.
 
@@ -87,6 +88,7 @@ def render_oracle(
         background: (3,) radiance behind the mesh, black if None.
         per_cell: Whether colour and density are constant in each cell.
         nudge: Offset added to the x and y components of all ray directions at z = 1.
+        color_per_cell: Whether colour alone is constant in each cell.
     """
     pose = camera.world_to_camera.to(torch.float64)
     points = vertices.to(torch.float64) @ pose[:3, :3].T + pose[:3, 3]
@@ -94,9 +96,42 @@ def render_oracle(
     offset, slope = barycentric_functions(points[tets.long()])
     crossings = find_crossings(offset.detach(), slope.detach(), directions)
     shape = (camera.height, camera.width)
-    return _integrate(
-        offset, slope, directions, crossings, _cell_values(tets, color, density, per_cell), background, shape
-    )
+    colors = _cell_values(tets, color, per_cell or color_per_cell)
+    values = torch.cat([colors, _cell_values(tets, density[:, None], per_cell)], dim=-1)
+    return _integrate(offset, slope, directions, crossings, values, background, shape)
+
+
+def optical_depths_oracle(
+    vertices: Tensor, tets: Tensor, density: Tensor, camera: Camera, distances: Tensor, per_cell: bool = False
+) -> Tensor:
+    """Optical depths from the camera to distances along its rays: sums over all cells that lie before them.
+
+    Args:
+        vertices: (V, 3) world-space positions.
+        tets: (T, 4) vertex indices, any orientation.
+        density: (V,), or (T,) if ``per_cell``.
+        camera: The camera; its extrinsics may require grad.
+        distances: (H, W, K) or (K,); may require grad.
+        per_cell: Whether the density is constant in each cell.
+
+    Returns:
+        (H, W, K) in float64.
+    """
+    pose = camera.world_to_camera.to(torch.float64)
+    points = vertices.to(torch.float64) @ pose[:3, :3].T + pose[:3, 3]
+    directions = pixel_directions(camera)
+    offset, slope = barycentric_functions(points[tets.long()])
+    crossings = find_crossings(offset.detach(), slope.detach(), directions)
+    t_in, t_out, rate = _spans(offset, slope, directions, crossings)
+    values = _cell_values(tets, density[:, None], per_cell)[crossings.cell, :, 0]
+    at_entry = ((offset[crossings.cell] + rate * t_in[:, None]) * values).sum(1)
+    rise = (rate * values).sum(1)
+    ends = torch.broadcast_to(distances.to(torch.float64), (camera.height, camera.width, distances.shape[-1]))
+    ends = ends.reshape(-1, ends.shape[-1])
+    length = (torch.minimum(ends[crossings.ray], t_out[:, None]) - t_in[:, None]).clamp(min=0.0)
+    parts = length * (at_entry[:, None] + 0.5 * rise[:, None] * length)
+    total = torch.zeros_like(ends).index_add(0, crossings.ray, parts)
+    return total.reshape(camera.height, camera.width, -1)
 
 
 def pixel_directions(camera: Camera, nudge: tuple[float, float] = (0.0, 0.0)) -> Tensor:
@@ -163,10 +198,21 @@ def quadrature(optical_depth: float) -> tuple[Tensor, Tensor]:
     return torch.from_numpy(nodes.ravel()), torch.from_numpy((lengths * 0.5 * w).ravel())
 
 
-def _cell_values(tets: Tensor, color: Tensor, density: Tensor, per_cell: bool) -> Tensor:
-    """(T, 4, 4) red, green, blue and density at the four corners of each cell."""
-    values = torch.cat([color.to(torch.float64), density.to(torch.float64)[:, None]], dim=-1)
-    return values[:, None].expand(-1, 4, -1) if per_cell else values[tets.long()]
+def _cell_values(tets: Tensor, values: Tensor, per_cell: bool) -> Tensor:
+    """(T, 4, C) values at the four corners of each cell."""
+    exact = values.to(torch.float64)
+    return exact[:, None].expand(-1, 4, -1) if per_cell else exact[tets.long()]
+
+
+def _spans(offset: Tensor, slope: Tensor, directions: Tensor, crossings: Crossings) -> tuple[Tensor, Tensor, Tensor]:
+    """(P,) distances where crossings begin and end, and (P, 4) slopes of the barycentric coordinates along the rays."""
+    rate = (slope[crossings.cell] * directions[crossings.ray, None]).sum(-1)
+
+    def distance_to(face: Tensor) -> Tensor:
+        column = face[:, None]
+        return (-offset[crossings.cell].gather(1, column) / rate.gather(1, column)).squeeze(1)
+
+    return distance_to(crossings.enter).clamp(min=0.0), distance_to(crossings.leave), rate
 
 
 def _integrate(
@@ -179,14 +225,8 @@ def _integrate(
     shape: tuple[int, int],
 ) -> OracleImage:
     ray, cell = crossings.ray, crossings.cell
-    rate = (slope[cell] * directions[ray, None]).sum(-1)
-
-    def distance_to(face: Tensor) -> Tensor:
-        column = face[:, None]
-        return (-offset[cell].gather(1, column) / rate.gather(1, column)).squeeze(1)
-
-    t_in = distance_to(crossings.enter).clamp(min=0.0)
-    length = distance_to(crossings.leave) - t_in
+    t_in, t_out, rate = _spans(offset, slope, directions, crossings)
+    length = t_out - t_in
     at_entry = ((offset[cell] + rate * t_in[:, None])[..., None] * values[cell]).sum(1)
     change = ((rate * length[:, None])[..., None] * values[cell]).sum(1)
 

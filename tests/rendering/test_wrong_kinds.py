@@ -18,13 +18,17 @@ from difftetvr.mesh.io import load, load_data, load_mesh
 from difftetvr.optics import ExactLinear, SubSegments, TransferFunction
 from difftetvr.rendering import (
     Camera,
+    CellFeatures,
     Detector,
     LensCamera,
     PanoramicCamera,
     ParallelCamera,
     Rays,
     ScalarField,
+    depth_at,
     render,
+    render_normals,
+    transmittance_at,
 )
 from difftetvr.rendering.gauss_newton import model_image
 from difftetvr.rendering.inspection import inspect_rays
@@ -56,6 +60,17 @@ CALLS: dict[str, tuple[Callable[..., Any], dict[str, Any], tuple[str, ...]]] = {
         RENDER,
         ("mesh", "field", "camera", "background", "renderer", "optics", "transmittance_threshold", "clip_plane"),
     ),
+    "depth_at": (
+        depth_at,
+        RENDER,
+        ("mesh", "field", "camera", "transmittance", "renderer", "deterministic", "clip_plane"),
+    ),
+    "transmittance_at": (
+        transmittance_at,
+        {**RENDER, "distances": 1.0},
+        ("mesh", "field", "camera", "distances", "renderer", "deterministic", "clip_plane"),
+    ),
+    "render_normals": (render_normals, RENDER, ("mesh", "field", "camera", "renderer", "transmittance_threshold")),
     "inspect_rays": (inspect_rays, {"mesh": MESH, "camera": CAMERA}, ("mesh", "camera", "renderer", "clip_plane")),
     "model_image": (
         model_image,
@@ -99,6 +114,7 @@ CALLS: dict[str, tuple[Callable[..., Any], dict[str, Any], tuple[str, ...]]] = {
         {"scalar": FIELD.density, "transfer_function": FUNCTION},
         ("scalar", "transfer_function", "attenuation", "value_range", "location"),
     ),
+    "CellFeatures": (CellFeatures, {"features": torch.zeros(48, 2), "medium": FIELD}, ("features", "medium")),
     "TransferFunction": (TransferFunction, POINTS, ("scalar", "opacity", "color")),
     "TransferFunction()": (FUNCTION, {}, ("scalar",)),
     "SubSegments": (SubSegments, {}, ("count",)),
@@ -106,6 +122,9 @@ CALLS: dict[str, tuple[Callable[..., Any], dict[str, Any], tuple[str, ...]]] = {
 ACCEPTED = {
     # What is no junk in these places: scalars may be arrays or tensors of any shape, views may be many.
     ("render", "camera"): ("cameras",),
+    ("depth_at", "camera"): ("cameras",),
+    ("transmittance_at", "camera"): ("cameras",),
+    ("render_normals", "camera"): ("cameras",),
     ("Rays", "origins"): ("tensor",),
     ("Rays", "directions"): ("tensor",),
     ("Rays", "near"): ("tensor",),

@@ -1,11 +1,13 @@
 from . import api as api
 from . import autograd as autograd
 from . import cameras as cameras
+from . import cell_features as cell_features
 from . import clip_plane as clip_plane
 from . import gauss_newton as gauss_newton
 from . import inspection as inspection
 from . import kernels as kernels
 from . import preparation as preparation
+from . import quantities as quantities
 from . import rays as rays
 from . import scalar_field as scalar_field
 from . import search as search
@@ -18,6 +20,10 @@ from .cameras.lens import LensCamera as LensCamera
 from .cameras.panoramic import PanoramicCamera as PanoramicCamera
 from .cameras.parallel import ParallelCamera as ParallelCamera
 from .cameras.pinhole import Camera as Camera
+from .cell_features import CellFeatures as CellFeatures
+from .quantities.along_rays import depth_at as depth_at
+from .quantities.along_rays import transmittance_at as transmittance_at
+from .quantities.normals import render_normals as render_normals
 from .rays import Rays as Rays
 from .rays import RaySource as RaySource
 from .scalar_field import ScalarField as ScalarField
@@ -25,6 +31,7 @@ from .tracers.projected import OrderWarning as OrderWarning
 
 __all__ = [
     "Camera",
+    "CellFeatures",
     "Detector",
     "LensCamera",
     "OrderWarning",
@@ -34,5 +41,8 @@ __all__ = [
     "Rays",
     "RenderedImage",
     "ScalarField",
+    "depth_at",
     "render",
+    "render_normals",
+    "transmittance_at",
 ]

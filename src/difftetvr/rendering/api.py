@@ -15,9 +15,13 @@ from difftetvr.inputs import as_reals
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.optics import OpticalModel
 from difftetvr.rendering.autograd import RenderFunction
+from difftetvr.rendering.cell_features import CellFeatures
 from difftetvr.rendering.preparation import ViewOptions, prepare_view
 from difftetvr.rendering.rays import Rays, RaySource
 from difftetvr.rendering.scalar_field import ScalarField
+
+_HALF, _OPAQUE = math.log(2.0), 1e3
+"""Optical depths of opacity 1/2, and at which the transmittance is 0 in every precision."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +42,19 @@ class RenderedImage:
     depth: torch.Tensor
     optical_depth: torch.Tensor
 
+    @property
+    def entropy(self) -> torch.Tensor:
+        """(H, W) entropy of the opacity, -a ln a - (1 - a) ln (1 - a) in nats, from 0 for clear or opaque rays to ln 2.
+
+        From the optical depth, so that it is accurate near both ends. Its derivative by the optical depth, which grows
+        without bound towards clear rays, is 0 at them.
+        """
+        is_clear = self.optical_depth <= 0
+        depth = torch.where(is_clear, 1.0, self.optical_depth).clamp(max=_OPAQUE)
+        thin, thick = depth.clamp(max=_HALF), depth.clamp(min=_HALF)
+        log_alpha = torch.where(depth < _HALF, torch.log(-torch.expm1(-thin)), torch.log1p(-torch.exp(-thick)))
+        return torch.where(is_clear, 0.0, depth * torch.exp(-depth) + torch.expm1(-depth) * log_alpha)
+
     def __getitem__(self, index: Any) -> RenderedImage:
         """Part of the image, by an index of (H, W) or (...)."""
         return RenderedImage(self.color[index], self.alpha[index], self.depth[index], self.optical_depth[index])
@@ -51,7 +68,7 @@ class RenderedImage:
 @overload
 def render(
     mesh: TetMesh,
-    field: Field | ScalarField,
+    field: Field | ScalarField | CellFeatures,
     camera: RaySource | Rays,
     background: torch.Tensor | tuple[float, ...] | None = None,
     renderer: str = "marching",
@@ -65,7 +82,7 @@ def render(
 @overload
 def render(
     mesh: TetMesh,
-    field: Field | ScalarField,
+    field: Field | ScalarField | CellFeatures,
     camera: Sequence[RaySource],
     background: torch.Tensor | tuple[float, ...] | None = None,
     renderer: str = "marching",
@@ -79,7 +96,7 @@ def render(
 @eager
 def render(
     mesh: TetMesh,
-    field: Field | ScalarField,
+    field: Field | ScalarField | CellFeatures,
     camera: RaySource | Rays | Sequence[RaySource],
     background: torch.Tensor | tuple[float, ...] | None = None,
     renderer: str = "marching",
@@ -97,7 +114,7 @@ def render(
     Args:
         mesh: Tetrahedral mesh; its vertices' device and dtype (float32 or float64) decide where and how to render.
         field: Channels and density per vertex (linear inside each cell) or per cell (constant); or scalars likewise,
-            with a transfer function.
+            with a transfer function; or channels per cell over the density of either (`CellFeatures`).
         camera: A camera, inside or outside of the mesh; any bundle of rays; or cameras, which are rendered together.
         background: (C,) channels behind the volume, linear RGB for colours; 0 if None.
         renderer: How crossings are found and ordered. ``"marching"`` walks from cell to cell; ``"linked-list"`` sorts
@@ -125,7 +142,7 @@ def render(
     one = lambda view: _render(mesh, field, view, background, options, clip_plane)  # noqa: E731
     if not isinstance(camera, Sequence):
         return one(camera)
-    cameras = _checked_cameras(camera)
+    cameras = checked_cameras(camera)
     # One after the other where each view has its own colours, or its own order of cells.
     if renderer == "projected" or getattr(field, "harmonics", None) is not None:
         return _together([one(view) for view in cameras])
@@ -141,7 +158,12 @@ def render(
     return tuple(parts)
 
 
-def _checked_cameras(cameras: Sequence[Any]) -> list[RaySource]:
+def checked_cameras(cameras: Sequence[Any]) -> list[RaySource]:
+    """Several cameras, or what a caller gave as such.
+
+    Raises:
+        DiffTetError: There are none, or one of them is no camera.
+    """
     if not cameras or not all(isinstance(c, RaySource) and not isinstance(c, type) for c in cameras):
         raise DiffTetError(
             f"camera is {shown(cameras)}; pass a difftetvr.Camera, a list of cameras, or difftetvr.Rays."
@@ -159,7 +181,7 @@ def _together(images: Sequence[RenderedImage]) -> RenderedImage | tuple[Rendered
 
 def _render(
     mesh: TetMesh,
-    field: Field | ScalarField,
+    field: Field | ScalarField | CellFeatures,
     camera: RaySource | Rays,
     background: torch.Tensor | tuple[float, ...] | None,
     options: ViewOptions,

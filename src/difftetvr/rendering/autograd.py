@@ -2,132 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch.autograd.function import once_differentiable
 
-from difftetvr.backend import Backend
-from difftetvr.mesh import TetMesh
-from difftetvr.optics import OpticalModel
 from difftetvr.recording import few_lengths, replayed
-from difftetvr.rendering.cameras.pinhole import Camera
-from difftetvr.rendering.kernels.adjoint import Gradients, ImageAdjoint, Wanted, render_adjoint
+from difftetvr.rendering.kernels.adjoint import ImageAdjoint, render_adjoint
 from difftetvr.rendering.kernels.composition import Composition, Pixels
 from difftetvr.rendering.kernels.forward import render_forward
-from difftetvr.rendering.kernels.layout import CellSource, GradientSource, VertexSource, collect
-from difftetvr.rendering.search.memory_order import MemoryOrder, OrderedMesh
-from difftetvr.rendering.tracers.aim import Aim
-from difftetvr.rendering.tracers.linked_list import LinkedList
-from difftetvr.rendering.tracers.marching import Marching
-from difftetvr.rendering.tracers.projected import Projected
-from difftetvr.rendering.traversal.bundle import BundleRays
-from difftetvr.rendering.traversal.crossing import Tracer, View
-from difftetvr.rendering.traversal.rays import KernelRays
-from difftetvr.rendering.traversal.transfer import Transfer
-from difftetvr.rendering.upload import LaidOut, Upload
-
-Content = Literal["vertex", "cell", "scalar"]
-"""What a volume holds: (V, C) channels and (V,) densities on vertices, (T, C) and (T,) on cells, or (V,) scalars, (K,)
-knots and (K, 4) densities and colours of their transfer function."""
-
-TRACERS: dict[str, Any] = {"marching": Marching, "linked-list": LinkedList, "projected": Projected}
-"""How crossings are found and ordered, by the name of the renderer."""
-
-
-@dataclass(frozen=True)
-class RenderTask:
-    """What a view needs besides tensors that may require gradients.
-
-    Attributes:
-        backend: Where kernels run.
-        mesh: The mesh, for its topology.
-        camera: The camera whose rays are traced; None for a bundle of rays.
-        order: (N,) int32 number of the ray that each lane of a bundle has; None for rays as they are numbered.
-        optics: Optical model of one cell.
-        content: What the volume holds.
-        channels: Number of channels C that are seen.
-        threshold: Transmittance at or below which rays stop.
-        deterministic: Whether sums over rays have a fixed order.
-        renderer: How crossings are found.
-    """
-
-    backend: Backend
-    mesh: TetMesh
-    camera: Camera | None
-    order: torch.Tensor | None
-    optics: OpticalModel
-    content: Content
-    channels: int
-    threshold: float
-    deterministic: bool
-    renderer: str = "marching"
-
-    def upload(self, vertices: torch.Tensor, pose: torch.Tensor | None, parts: Sequence[torch.Tensor]) -> Upload:
-        """What kernels are sent of a view.
-
-        Args:
-            vertices: (V, 3) in the space of the rays, or that of the mesh.
-            pose: (4, 4) transform from the one to the other; None for the first.
-            parts: What the volume holds, see :data:`Content`.
-        """
-        backend, order = self.backend, MemoryOrder.of(self.mesh)
-        tables, is_vertex = order.tables(backend), self.content == "vertex"
-        first, second = (None if part is None or not part.numel() else backend.floats(part) for part in parts[:2])
-        cells = None
-        if self.content == "cell":
-            cells = CellSource(backend, tables.cells, second, first, self.channels)
-        source = VertexSource(
-            backend,
-            tables.vertices,
-            backend.floats(vertices),
-            None if pose is None else backend.floats(pose),
-            {"vertex": second, "cell": None, "scalar": first}[self.content],
-            is_vertex,
-            first if is_vertex else None,
-            self.channels if is_vertex else 0,
-        )
-        return Upload(self.mesh, order, tables, source, cells)
-
-    def rays(self, lines: torch.Tensor | None) -> KernelRays:
-        """The rays: a bundle of (N, 6) origins and unit directions, or those of the camera."""
-        if lines is not None:
-            return BundleRays.of(self.backend, lines, self.order)
-        assert self.camera is not None
-        return self.camera.kernel_rays(self.backend)
-
-    def tracer(
-        self, upload: Upload, laid_out: LaidOut, limits: torch.Tensor | None, rays: KernelRays, parts: Any
-    ) -> Tracer:
-        """What crosses a mesh that is laid out.
-
-        Args:
-            upload: The mesh.
-            laid_out: The same, in memory.
-            limits: (N, 2) distances between which each ray is looked at; None for all in front of its origin.
-            rays: The rays.
-            parts: What the volume holds, see :data:`Content`.
-        """
-        backend = self.backend
-        view = View(
-            backend,
-            rays,
-            self.optics,
-            self.channels,
-            laid_out.records,
-            laid_out.cells,
-            Transfer.of(backend, parts[1], parts[2]) if self.content == "scalar" else None,
-            backend.opaque(self.threshold),
-            None if limits is None else backend.floats(limits),
-            backend.lanes(rays.lane_count),
-        )
-        stride, extent = upload.vertices.stride, laid_out.device_extent
-        ordered = OrderedMesh(backend, upload.order, upload.tables, laid_out.records, stride, extent)
-        scene = upload.scene(laid_out.records, rays)
-        tracer: Tracer = TRACERS[self.renderer].of(Aim(view, scene, ordered, self.mesh, laid_out.entries))
-        return tracer
+from difftetvr.rendering.kernels.gradients import Gradients, Wanted
+from difftetvr.rendering.kernels.layout import GradientSource, collect
+from difftetvr.rendering.search.memory_order import MemoryOrder
+from difftetvr.rendering.task import RenderTask
+from difftetvr.rendering.traversal.crossing import Tracer
 
 
 class RenderFunction(torch.autograd.Function):
@@ -171,19 +60,13 @@ class RenderFunction(torch.autograd.Function):
         with backend.exclusive(one_thread=task.deterministic):
             image = ImageAdjoint(Pixels(*derivatives), ctx.how, *ctx.gathered)
             gradients = render_adjoint(shot.tracer, image, task.mesh.num_vertices, wanted)
-            positions, channels, values = _collected(task, gradients, pose)
-            by_pose = _by_pose(task, gradients, vertices) if needs_pose else None
-            limits = backend.tensor(gradients.limits, -1, 2) if needs_limits else None
-            lines = backend.tensor(gradients.lines, -1, 6) if needs_lines else None
-            parts = [channels, values]
-            if gradients.transfer is not None:
-                table = backend.tensor(gradients.transfer.values).reshape(-1, 4)
-                parts = [values, backend.tensor(gradients.transfer.knots), table]
+            geometry, parts = gradient_tensors(task, gradients, pose, vertices)
         by_background = None
         if needs_background and optical_depth is not None and by_image[0] is not None:
             by_background = (torch.exp(-optical_depth)[:, None] * by_image[0]).sum(0)
         asked = (part if needed else None for part, needed in zip(parts, ctx.needs_input_grad[7:], strict=True))
-        return None, None, positions if needs_vertices else None, by_pose, by_background, limits, lines, *asked
+        positions = geometry.vertices if needs_vertices else None
+        return None, None, positions, geometry.pose, by_background, geometry.limits, geometry.lines, *asked
 
 
 @dataclass(frozen=True)
@@ -203,34 +86,68 @@ class Shot:
     unit: float
 
 
-def _collected(task: RenderTask, gradients: Gradients, pose: torch.Tensor | None) -> tuple[Any, Any, Any]:
-    """Gradients in the caller's order: (V, 3) by positions, None if not wanted, (M, C) by channels, (M,) by values."""
+@dataclass(frozen=True)
+class GeometryGradients:
+    """Derivatives by (V, 3) vertices, their (4, 4) pose, (N, 2) limits and (N, 6) lines; None for those not wanted."""
+
+    vertices: torch.Tensor | None
+    pose: torch.Tensor | None
+    limits: torch.Tensor | None
+    lines: torch.Tensor | None
+
+
+def gradient_tensors(
+    task: RenderTask, gradients: Gradients, pose: torch.Tensor | None, vertices: torch.Tensor | None
+) -> tuple[GeometryGradients, list[torch.Tensor | None]]:
+    """Derivatives in the caller's order and space, by geometry and by all parts of the content.
+
+    Args:
+        task: What was rendered.
+        gradients: What kernels found, in the order of memory and the space of the rays.
+        pose: (4, 4) transform to that space; None where vertices are in it.
+        vertices: (V, 3) in front of the pose; None where no gradient by the pose is wanted.
+    """
     backend, tables = task.backend, MemoryOrder.of(task.mesh).tables(task.backend)
+    has_channels = task.content == "vertex" and not task.has_features
     transform = None if pose is None else backend.floats(pose)
-    channels = 0 if task.content == "scalar" else task.channels
-    vertices, cells = task.mesh.num_vertices, task.mesh.num_cells
-    if task.content == "cell":
-        positions, _, _ = _collect(
-            GradientSource(backend, tables.vertices, gradients.vertices, transform, None, 0), vertices
-        )
-        source, count = GradientSource(backend, tables.cells, None, None, gradients.field, channels), cells
-        _, by_channel, by_value = _collect(source, count)
-    else:
-        source = GradientSource(backend, tables.vertices, gradients.vertices, transform, gradients.field, channels)
-        positions, by_channel, by_value = _collect(source, vertices)
-        count = vertices
-    return (
-        None if positions is None else backend.tensor(positions, -1, 3)[:vertices],
-        backend.tensor(by_channel)[: count * channels].reshape(count, channels),
-        backend.tensor(by_value)[:count],
+    at_vertices = GradientSource(
+        backend,
+        tables.vertices,
+        gradients.vertices,
+        transform,
+        gradients.field,
+        task.channels if has_channels else 0,
     )
+    at_cells = GradientSource(backend, tables.cells, None, None, gradients.cells, task.channels)
+    positions, channels, values = _collected(at_vertices, task.mesh.num_vertices)
+    _, cell_channels, cell_densities = _collected(at_cells, task.mesh.num_cells)
+    geometry = GeometryGradients(
+        positions,
+        None if vertices is None else _by_pose(task, gradients, vertices),
+        None if gradients.limits is None else backend.tensor(gradients.limits, -1, 2),
+        None if gradients.lines is None else backend.tensor(gradients.lines, -1, 6),
+    )
+    if task.content == "cell":
+        return geometry, [cell_channels, cell_densities]
+    parts = [cell_channels] if task.has_features else [channels] if has_channels else []
+    parts.append(values)
+    if gradients.transfer is not None:
+        transfer = gradients.transfer
+        parts += [backend.tensor(transfer.knots), backend.tensor(transfer.values, -1, 4)]
+    return geometry, parts
 
 
-def _collect(source: GradientSource, count: int) -> tuple[Any, Any, Any]:
+def _collected(source: GradientSource, count: int) -> tuple[torch.Tensor | None, ...]:
+    """Derivatives by (M, 3) positions, (M, C) channels and (M,) values; None for those not wanted."""
     if source.vectors is None and source.records is None:
         return None, None, None
-    gradients: tuple[Any, Any, Any] = replayed(collect, source, few_lengths(count))
-    return gradients
+    positions, channels, values = replayed(collect, source, few_lengths(count))
+    backend, width = source.backend, source.channels
+    return (
+        None if positions is None else backend.tensor(positions, -1, 3)[:count],
+        None if channels is None else backend.tensor(channels)[: count * width].view(count, width),
+        None if values is None else backend.tensor(values)[:count],
+    )
 
 
 def _by_pose(task: RenderTask, gradients: Gradients, vertices: torch.Tensor) -> torch.Tensor:

@@ -14,12 +14,14 @@ from difftetvr.errors import DiffTetError, MeshError, shown
 from difftetvr.inputs import as_number, require_type
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.optics import ConstantPerCell, ExactLinear, OpticalModel
-from difftetvr.rendering.autograd import TRACERS, Content, RenderTask, Shot
+from difftetvr.rendering.autograd import Shot
 from difftetvr.rendering.cameras.pinhole import Camera
+from difftetvr.rendering.cell_features import CellFeatures
 from difftetvr.rendering.clip_plane import clip_limits, clip_rays
 from difftetvr.rendering.kernels.layout import LARGEST
 from difftetvr.rendering.rays import Rays, RaySource, image_order
 from difftetvr.rendering.scalar_field import ScalarField
+from difftetvr.rendering.task import TRACERS, Content, RenderTask
 from difftetvr.rendering.traversal.crossing import Tracer
 from difftetvr.rendering.traversal.rays import KernelRays
 from difftetvr.rendering.upload import Extent, LaidOut, Upload, lay_out, lay_out_for_camera
@@ -50,7 +52,7 @@ class PreparedView:
         shape: Of the image or bundle; N is the number of its rays.
         vertices: (V, 3) in a unit in which products neither vanish nor overflow.
         pose: (4, 4) transform from their space to that of the rays; None where these are the same.
-        parts: What the volume holds, see :data:`difftetvr.rendering.autograd.Content`; densities are in that unit.
+        parts: What the volume holds, see :data:`difftetvr.rendering.task.Content`; densities are in that unit.
         unit: The unit, in world units.
         bundle: The rays, where they are not a camera's.
         rays: The rays as kernels read them.
@@ -148,7 +150,7 @@ class PreparedRays:
 
 
 def prepare_view(
-    mesh: TetMesh, field: Field | ScalarField, camera: RaySource | Rays, options: ViewOptions
+    mesh: TetMesh, field: Field | ScalarField | CellFeatures, camera: RaySource | Rays, options: ViewOptions
 ) -> PreparedView:
     """Check a view's inputs and bring them to kernels; arguments and errors are those of :func:`difftetvr.render`."""
     options = _checked(mesh, field, camera, options)
@@ -172,6 +174,7 @@ def prepare_view(
         order = None if places is None else torch.from_numpy(places).to(mesh.vertices.device)
         bundle = PreparedRays.of(source, mesh)
         passed = _Passed(mesh.vertices, None, parts, 1.0)
+    has_features = isinstance(field, CellFeatures) and content != "cell"
     task = RenderTask(
         backend_for(mesh.vertices),
         mesh,
@@ -179,10 +182,11 @@ def prepare_view(
         order,
         options.optics or (ConstantPerCell() if content == "cell" else ExactLinear()),
         content,
-        3 if content == "scalar" else parts[0].shape[1],
+        3 if content == "scalar" and not has_features else parts[0].shape[1],
         options.transmittance_threshold,
         options.deterministic,
         options.renderer,
+        has_features,
     )
     if task.renderer == "marching":
         mesh.topology.cell_adjacency  # noqa: B018  refuses loose cells, which have none
@@ -235,7 +239,8 @@ def _uncommon(task: RenderTask, passed: _Passed) -> tuple[RenderTask, _Passed]:
     positions = mesh.vertices if task.camera is None else _camera_space(mesh, task.camera)
     parts = tuple(part.to(positions.dtype) for part in passed.parts)
     if task.content != "scalar":
-        Field(parts[0], parts[1], task.content).validate(mesh)
+        color = parts[1].new_zeros(len(parts[1]), 0) if task.has_features else parts[0]
+        Field(color, parts[1], task.content).validate(mesh)
     vertices, unit = _unit_of_length(positions, mesh)
     task = replace(task, backend=backend_for(vertices))
     return task, _Passed(vertices, None, _parts_by_unit(task.content, parts, unit), unit)
@@ -244,7 +249,8 @@ def _uncommon(task: RenderTask, passed: _Passed) -> tuple[RenderTask, _Passed]:
 def _checked(mesh: Any, field: Any, camera: Any, options: ViewOptions) -> ViewOptions:
     """Refuse arguments of the wrong kind, those first that come in batches elsewhere."""
     require_type(mesh, TetMesh, "mesh", "pass a difftetvr.TetMesh", DiffTetError)
-    require_type(field, (Field, ScalarField), "field", "pass one difftetvr.Field or ScalarField", DiffTetError)
+    fields = (Field, ScalarField, CellFeatures)
+    require_type(field, fields, "field", "pass one difftetvr.Field, ScalarField or CellFeatures", DiffTetError)
     # The protocol is slow to ask.
     if type(camera) is not Camera and (isinstance(camera, type) or not isinstance(camera, (Rays, RaySource))):
         raise DiffTetError(f"camera is {shown(camera)}; {CAMERAS}.")
@@ -277,10 +283,13 @@ def as_rays(camera: RaySource | Rays) -> Rays:
 
 
 def _content(
-    mesh: TetMesh, field: Field | ScalarField, camera: Camera | Rays
+    mesh: TetMesh, field: Field | ScalarField | CellFeatures, camera: Camera | Rays
 ) -> tuple[Content, tuple[torch.Tensor, ...]]:
     """What the volume holds, and its tensors as they are."""
     location = field.location_on(mesh)
+    if isinstance(field, CellFeatures):
+        content, medium = _content(mesh, field.without_colours(), camera)
+        return content, (field.features, *(medium if content == "scalar" else medium[1:]))
     if isinstance(field, ScalarField):
         if location == "vertex":
             return "scalar", (field.normalised(), *field.knots(mesh.vertices))
@@ -362,7 +371,7 @@ def _parts_by_unit(content: Content, parts: tuple[torch.Tensor, ...], unit: floa
     if unit == 1.0:
         return parts
     if content == "scalar":
-        return (*parts[:2], torch.cat((_by_unit(parts[2][:, :1], unit), parts[2][:, 1:]), dim=1))
+        return (*parts[:-1], torch.cat((_by_unit(parts[-1][:, :1], unit), parts[-1][:, 1:]), dim=1))
     return parts[0], _by_unit(parts[1], unit)
 
 

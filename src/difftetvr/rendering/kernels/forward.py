@@ -13,16 +13,10 @@ import drjit as dr
 
 from difftetvr.recording import replayed
 from difftetvr.rendering.kernels.composition import Composition, Pixels
-from difftetvr.rendering.traversal.crossing import (
-    Span,
-    Step,
-    Tracer,
-    corner_of,
-    read_channels,
-    read_vertex,
-)
+from difftetvr.rendering.kernels.segments import SegmentKernel
+from difftetvr.rendering.traversal.crossing import Step, Tracer, read_channels
 from difftetvr.rendering.traversal.rays import Lanes
-from difftetvr.rendering.traversal.walk import Corner, Face
+from difftetvr.rendering.traversal.walk import Face
 
 
 @dataclass
@@ -75,13 +69,12 @@ def _forward(tracer: Tracer, how: Composition, count: int) -> Rendered:
     return rendered
 
 
-class _ForwardKernel:
-    """Gathers light; see :class:`difftetvr.rendering.traversal.crossing.Kernel`."""
+class _ForwardKernel(SegmentKernel):
+    """Gathers light."""
 
     def __init__(self, tracer: Tracer, rays: Lanes, rendered: Rendered, how: Composition) -> None:
-        self.view, self.rays, self.rendered, self.how = tracer.view, rays, rendered, how
-        self.span = Span.of(tracer, rays)
-        self.slots = 1 if self.view.has_vertex_channels else 0
+        super().__init__(tracer, rays, slots=1 if tracer.view.has_vertex_channels else 0)
+        self.rendered, self.how = rendered, how
 
     def start(self) -> Radiance:
         real, lanes = self.view.backend.Float, dr.width(self.rays.pixel)
@@ -90,28 +83,11 @@ class _ForwardKernel:
         )
         return Radiance(channels, distance, optical_depth, dr.ones(real, lanes), carry)
 
-    def read(self, vertex: Any, active: Any) -> Corner:
-        position, attributes = read_vertex(self.view, vertex, active)
-        return corner_of(self.rays.frame, vertex, position, attributes, self.slots)
-
     def visit(self, step: Step, ray: Radiance) -> Radiance:
-        view, entry, leaving, clip = self.view, step.entry, step.leaving, None
-        if view.transfer is not None:
-            entry = view.transfer.bounded(entry, step.face)
-            leaving = view.transfer.bounded(leaving, step.next_face)
-        if self.span is not None:
-            clip = self.span.clip(entry[0], leaving[0])
-            entry, leaving = clip.start(entry, leaving), clip.end(entry, leaving)
-        if view.transfer is not None:
-            return view.transfer.cut(
-                entry, leaving, lambda piece, ray: self._gather(piece.start_values, piece.end_values, ray), ray
-            )
-        if view.cells is not None:
-            *channels, density = view.records.gather(view.backend, view.cells, step.cell)
-            return self._gather([entry[0], density, *channels], [leaving[0], density, *channels], ray)
-        ray, w0, w1 = self._pass(entry, leaving, ray)
         if not self.slots:
-            return ray
+            return super().visit(step, ray)
+        entry, leaving, clip = self.clipped(step)
+        ray, w0, w1 = self._pass(entry, leaving, ray)
         if clip is not None:
             w0, w1 = clip.unclipped(w0, w1)
         _distribute(step.face, w0 + ray.carry[0])
@@ -131,8 +107,7 @@ class _ForwardKernel:
         passed = Radiance(ray.channels, distance, optical_depth, ray.transmittance * transmittance, ray.carry)
         return passed, w0, w1
 
-    def _gather(self, entry: list[Any], leaving: list[Any], ray: Radiance) -> Radiance:
-        """Pass a segment whose channels are linear, too, and given behind distance and density."""
+    def pass_segment(self, entry: list[Any], leaving: list[Any], ray: Radiance) -> Radiance:
         ray, w0, w1 = self._pass(entry[:2], leaving[:2], ray)
         values = zip(entry[2:], leaving[2:], ray.channels, strict=True)
         channels = [dr.fma(w0, c0, dr.fma(w1, c1, c)) for c0, c1, c in values]

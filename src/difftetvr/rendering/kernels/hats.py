@@ -26,7 +26,7 @@ from difftetvr.mesh import TetMesh
 from difftetvr.mesh.topology.incidence import cell_edges, cell_faces
 from difftetvr.mesh.topology.topology import LOCAL_EDGE_OF, LOCAL_EDGES, Topology
 from difftetvr.recording import few_lengths, replayed
-from difftetvr.rendering.kernels.adjoint import reduce_mode
+from difftetvr.rendering.kernels.gradients import reduce_mode
 from difftetvr.rendering.search.memory_order import MemoryOrder
 from difftetvr.rendering.traversal.crossing import (
     Span,

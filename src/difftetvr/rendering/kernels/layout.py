@@ -52,12 +52,20 @@ class VertexSource:
 
 @dataclass
 class CellSource:
-    """What cells hold, as flat arrays of the caller: (T,) their order, (T,) densities and (T, C) channels."""
+    """What cells hold, as flat arrays of the caller.
+
+    Attributes:
+        backend: Array types.
+        order: (T,) the caller's number of each cell in the order of memory.
+        density: (T,); None where cells have none.
+        channels: (T, C); None where C is 0.
+        channel_count: C.
+    """
 
     backend: Backend
     order: Any
-    density: Any
-    channels: Any
+    density: Any | None
+    channels: Any | None
     channel_count: int
 
 
@@ -98,7 +106,7 @@ def lay_out_vertices(source: VertexSource, length: int) -> tuple[Any, Any]:
 def lay_out_cells(source: CellSource, length: int) -> tuple[Any, Any]:
     """Records of cells' channels and densities, for :func:`difftetvr.recording.replayed`; likewise."""
     backend, cell, count = source.backend, source.order, source.channel_count
-    density = dr.gather(backend.Float, source.density, cell)
+    density = backend.Float(0) if source.density is None else dr.gather(backend.Float, source.density, cell)
     channels = [dr.gather(backend.Float, source.channels, count * cell + k) for k in range(count)]
     extent = dr.full(backend.Float, -dr.inf, EXTENT)
     is_bad = _any_unbounded([density, *channels]) | (density < 0)

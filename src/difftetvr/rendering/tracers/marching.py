@@ -60,6 +60,8 @@ class Marching:
         uint = self.view.backend.UInt
         offset = dr.gather(uint, self.entries.offset, rays.pixel, rays.valid)
         count = dr.gather(uint, self.entries.count, rays.pixel, rays.valid)
+        limits = self.view.limits
+        far = None if limits is None else dr.gather(self.view.backend.Float2, limits, rays.pixel, rays.valid)[1]
 
         def enter(index: Any, ray: Any) -> tuple[Any, Any]:
             active = (index < count) & rays.valid
@@ -76,6 +78,8 @@ class Marching:
             link = table_row(cell, step.exit.vertex(face), face, step.apex)
             behind = dr.gather(self.view.backend.UInt2, self.table, link, active)
             active = active & (behind[0] != BOUNDARY) & kernel.goes_on(ray)
+            if far is not None:  # nothing of what follows is looked at
+                active &= step.leaving[0] < far
             return active, behind[0], behind[1], step.next_face, step.leaving, ray
 
         ray = kernel.start()

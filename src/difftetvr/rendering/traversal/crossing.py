@@ -30,11 +30,12 @@ class View:
         rays: The rays.
         optics: Optical model of one cell.
         channels: Number of channels C that are seen.
-        vertices: Vertex records: (V, 4) x, y, z and the scalar, 0 for per-cell fields; or x, y, z, density, then the
-            channels in whole packets of four, so that for RGB one cache line holds all of a vertex.
-        cells: Records of channels and density for per-cell fields, see
-            :class:`difftetvr.rendering.traversal.records.Records`; else None.
-        transfer: Transfer function of the vertices' scalars, None where vertices have densities and channels.
+        vertices: Vertex records: (V, 4) x, y, z and the density or scalar, 0 if cells hold the density; or x, y, z,
+            density, then the channels in whole packets of four, so that for RGB one cache line holds all of a vertex.
+        cells: Records of channels and density of cells, see :class:`difftetvr.rendering.traversal.records.Records`;
+            None where channels, if any, are those of vertices or of a transfer function.
+        has_cell_density: Whether the density is that of cells, too.
+        transfer: Transfer function of the vertices' scalars, None where vertices or cells have densities.
         threshold: Transmittance at or below which light counts as gone, as a device value.
         limits: (N, 2) distances between which each ray is looked at, None for all in front of its origin.
         lane: The numbers of all lanes.
@@ -46,6 +47,7 @@ class View:
     channels: int
     vertices: Any
     cells: Any | None
+    has_cell_density: bool
     transfer: Transfer | None
     threshold: Any
     limits: Any | None
@@ -143,10 +145,10 @@ def cross_cell(kernel: Kernel, cell: Any, vertices: list[Any], ray: Any, active:
 
 
 def read_vertex(view: View, vertex: Any, active: Any) -> tuple[Any, list[Any]]:
-    """A vertex's position record and its attribute: density, a scalar, or none for per-cell fields."""
+    """A vertex's position record and its attribute: density, a scalar, or none where cells hold the density."""
     stride = 1 + packets_of(view.channels) if view.has_vertex_channels else 1
     position = dr.gather(view.backend.Float4, view.vertices, stride * vertex if stride > 1 else vertex, active)
-    return position, [] if view.cells is not None else [position[3]]
+    return position, [] if view.has_cell_density else [position[3]]
 
 
 def read_channels(view: View, vertex: Any, active: Any) -> list[Any]:
@@ -184,13 +186,17 @@ class Span:
         return Span(view.backend.Float(0), None) if tracer.starts_inside else None
 
     def clip(self, t0: Any, t1: Any) -> Clip:
-        """The part of a crossing from t0 to t1 that lies in the span."""
+        """The part of a crossing from t0 to t1 that lies in the span.
+
+        An end of the span that is exactly at a face decides there, and does so in one of the face's cells alone.
+        """
         inverse = inverse_length(t0, t1)
-        at_near = t0 < self.near
+        at_near = t0 <= self.near
         first = dr.select(at_near, dr.fmin((self.near - t0) * inverse, 1.0), 0.0)
+        first = dr.select(t1 <= self.near, 1.0, first)
         if self.far is None:
             return Clip(first, type(first)(1), at_near, dr.zeros(dr.mask_t(first)))
-        at_far = t1 > self.far
+        at_far = t1 >= self.far
         last = dr.select(at_far, dr.fmax((self.far - t0) * inverse, 0.0), 1.0)
         return Clip(first, dr.fmax(last, first), at_near, at_far)
 

@@ -216,7 +216,7 @@ class PieceAdjoint:
         Args:
             at_start: Derivatives by distance, density and radiance <pixel, RGB> where the piece starts.
             at_end: The same where it ends.
-            pixel: Derivatives by the pixel's linear RGB.
+            pixel: Derivatives by the pixel's linear RGB; none where the colours are not seen.
             total: Sums so far.
 
         Returns:
@@ -226,7 +226,7 @@ class PieceAdjoint:
         low, high = [at_start[0] * 0.0] * 2, [at_start[0] * 0.0] * 2
         knot_low, knot_high = at_start[0] * 0.0, at_start[0] * 0.0
         entry, leaving = list(total.entry), list(total.leaving)
-        change = [piece.change[0], sum((g * c for g, c in zip(pixel, piece.change[1:], strict=True)), low[0])]
+        change = [piece.change[0], sum((g * c for g, c in zip(pixel, piece.change[1:], strict=False)), low[0])]
         places = ((piece.begin, piece.weights[0], at_start), (piece.end, piece.weights[1], at_end))
         for is_end, (place, weight, gradient) in enumerate(places):
             low = [dr.fma(1.0 - weight, g, s) for g, s in zip(gradient[1:], low, strict=True)]
