@@ -43,8 +43,11 @@ from .rendering.cameras.pinhole import Camera as Camera
 from .rendering.rays import Rays as Rays
 from .rendering.rays import RaySource as RaySource
 from .rendering.scalar_field import ScalarField as ScalarField
+from .sampling.grid_files import save_grid as save_grid
 from .sampling.isosurfaces import isosurface as isosurface
 from .sampling.probing import probe as probe
+from .sampling.slabs import voxelise_to_file as voxelise_to_file
+from .sampling.surface_files import save_surface as save_surface
 from .sampling.voxels import voxelise as voxelise
 from .trust import trusting as trusting
 
@@ -84,6 +87,9 @@ __all__ = [
     "probe",
     "render",
     "save",
+    "save_grid",
+    "save_surface",
     "trusting",
     "voxelise",
+    "voxelise_to_file",
 ]
