@@ -225,6 +225,17 @@ def test_far_from_the_origin_glb_is_as_fine_as_near_it(tmp_path: Path) -> None:
     np.testing.assert_allclose(local + np.array(translation), far, atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("suffix", "size", "shift"), [(".glb", 1e60, 0.0), (".glb", 1e-60, 0.0), (".stl", 1e60, 0.0), (".stl", 1.0, 5.4e6)]
+)
+def test_what_float32_would_round_away_is_refused(tmp_path: Path, suffix: str, size: float, shift: float) -> None:
+    places, triangles, _ = ball(torch.float64)
+    with pytest.raises(MeshError, match=rf"A {suffix} has float32 only, .* write a \.ply\."):
+        save_surface(tmp_path / f"s{suffix}", size * places + shift, triangles)
+    assert not list(tmp_path.iterdir())
+    save_surface(tmp_path / "s.ply", size * places + shift, triangles)
+
+
 def test_the_same_surface_is_the_same_bytes(tmp_path: Path) -> None:
     for suffix in (".ply", ".glb", ".vtp", ".obj", ".stl"):
         for name in ("a", "b"):

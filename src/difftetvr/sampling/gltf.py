@@ -19,6 +19,7 @@ _ALIGNMENT = 4
 _FLOAT, _UNSIGNED_INT = 5126, 5125
 _OF_VERTICES, _OF_INDICES = 34962, 34963
 _LONGEST = 2**32 - 1
+_MOST_ROUNDED = 1e-3  # of a surface's size
 _Z_TO_Y = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]  # quaternion x y z w: a quarter of a turn around x
 
 
@@ -38,10 +39,10 @@ def write_glb(
         colors: (P, 3) linear RGB in [0, 1], or None.
 
     Raises:
-        MeshError: It takes more than the 4 GiB that such a file can have.
+        MeshError: It takes more than the 4 GiB that such a file can have, or its size is beyond float32.
     """
     center = 0.5 * (places.min(axis=0).astype(np.float64) + places.max(axis=0))
-    local = (places - center).astype("<f4")
+    local = rounded_places(places - center, ".glb")
     attributes = {"POSITION": local, "NORMAL": normals.astype("<f4")}
     if colors is not None:
         attributes["COLOR_0"] = colors.astype("<f4")
@@ -69,6 +70,29 @@ def write_glb(
         "buffers": [{"byteLength": sum(part.nbytes for part in parts)}],
     }
     _write_chunks(file, content, parts)
+
+
+def rounded_places(places: np.ndarray, suffix: str) -> np.ndarray:
+    """Places as float32, little-endian.
+
+    Args:
+        places: (..., 3) places.
+        suffix: Of the format that has no other numbers, for the sentence.
+
+    Raises:
+        MeshError: Too little would be left of the surface: it is too large or too small, or too far from where it is
+            counted from.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        single = places.astype("<f4")
+        rounding = np.abs(places - single).max()
+    span = float(np.ptp(places.reshape(-1, 3), axis=0).max())
+    if not rounding <= _MOST_ROUNDED * span:
+        raise MeshError(
+            f"A {suffix} has float32 only, which would round places by {rounding:.3g} on a surface that is {span:.3g} "
+            "across; write a .ply."
+        )
+    return single
 
 
 def _views(parts: list[np.ndarray]) -> list[dict[str, int]]:

@@ -19,7 +19,7 @@ from difftetvr.errors import MeshError, shown
 from difftetvr.files import atomic_write
 from difftetvr.inputs import as_reals
 from difftetvr.mesh.io.formats.vtk.xml_writing import piece, write_section
-from difftetvr.sampling.gltf import write_glb
+from difftetvr.sampling.gltf import rounded_places, write_glb
 from difftetvr.srgb import Encoding, linear_to_srgb, srgb_to_linear
 
 _MOST_VERTICES = 2**31 - 1  # what PLY counts in an int
@@ -81,7 +81,8 @@ def save_surface(
         encoding: What the colours are: "linear", or "srgb" of models that were fitted to photographs.
 
     Raises:
-        MeshError: The suffix is another, there is no triangle, an argument is not valid, or the file cannot be written.
+        MeshError: The suffix is another, there is no triangle, an argument is not valid, float32 would round away the
+            shape where a format has no other numbers, or the file cannot be written.
     """
     require_surface_format(path)
     surface = _checked(path, vertices, triangles, colors, encoding)
@@ -199,7 +200,8 @@ def _write_obj(file: BinaryIO, surface: Surface) -> None:
 
 
 def _write_stl(file: BinaryIO, surface: Surface) -> None:
-    corners = surface.places[surface.triangles]
+    places = rounded_places(surface.places, ".stl")
+    corners = places[surface.triangles]
     flat = np.arange(3 * len(corners)).reshape(-1, 3)
     rows = np.zeros(len(corners), dtype=[("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attributes", "<u2")])
     rows["normal"] = _normals(corners.reshape(-1, 3).astype(np.float64), flat)[::3]
