@@ -72,7 +72,7 @@ def test_nrrd_and_npy_hold_what_voxelise_gives(tmp_path: Path, mesh: TetMesh, op
         np.testing.assert_array_equal(raw.values.transpose(2, 1, 0), expected)
     np.testing.assert_array_equal(np.load(tmp_path / "v.npy").transpose(2, 1, 0), expected)
     header = (tmp_path / "v.nrrd").read_bytes().partition(b"\n\n")[0].decode("ascii")
-    assert f"have the value {options.get('outside', 0):g}." in header
+    assert f"have the value {options.get('outside', 0.0)!r}." in header
     assert ("Means of 2^3 points" in header) == ("samples" in options)
     volume = Volume.load(tmp_path / "v.nrrd", value_range=(-4.0, 2.0))
     assert volume.resolution == GRID.shape and volume.spacing == pytest.approx(GRID.spacing)
@@ -205,7 +205,7 @@ def test_too_little_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr("difftetvr.trust.free_memory", lambda: 2**27)
     with pytest.raises(MeshError, match=r"layer of the grid of 4000 x 4000 x 2 points would take .* choose a coarser"):
         voxelise_to_file(
-            tmp_path / "v.nrrd", mesh, torch.rand(mesh.num_vertices), Grid((0, 0, 0), 1.0, (4000, 4000, 2))
+            tmp_path / "v.nrrd", mesh, torch.rand(mesh.num_vertices), Grid((0, 0, 0), (1.0,) * 3, (4000, 4000, 2))
         )
     voxelise_to_file(tmp_path / "v.nrrd", mesh, torch.rand(mesh.num_vertices), GRID)
 

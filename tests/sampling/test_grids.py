@@ -100,7 +100,7 @@ def test_meshes_far_away_are_not_rounded() -> None:
 
 def test_indices_of_a_mesh() -> None:
     mesh = TetMesh.grid((1, 1, 1), (1, 2, 3), (2, 4, 6), dtype=torch.float64)
-    first, last = Grid((0, 0, 0), 0.5, (4, 4, 4), EXCHANGES[-1]).corner_indices(mesh)
+    first, last = Grid((0, 0, 0), (0.5,) * 3, (4, 4, 4), EXCHANGES[-1]).corner_indices(mesh)
     # The last one: axes z, y, x, all reversed.
     assert first == pytest.approx([-12, -8, -4]) and last == pytest.approx([-6, -4, -2])
 

@@ -8,7 +8,6 @@ Sources: https://teem.sourceforge.net/nrrd/format.html, and "VTK XML File Format
 from __future__ import annotations
 
 import gzip
-import os
 import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -57,7 +56,7 @@ class ArrayOfGrid:
 
 
 def save_grid(
-    path: str | os.PathLike[str], values: torch.Tensor | Mapping[str, torch.Tensor], grid: Grid, remark: str = ""
+    path: str | Path, values: torch.Tensor | Mapping[str, torch.Tensor], grid: Grid, remark: str = ""
 ) -> None:
     """Writes values that `voxelise` gave, or any others on a regular grid; the suffix chooses the format.
 
@@ -104,9 +103,7 @@ def save_grid(
     write_grid(path, arrays, grid, slabs(), remark)
 
 
-def write_grid(
-    path: str | os.PathLike[str], arrays: Sequence[ArrayOfGrid], grid: Grid, slabs: Iterable[Slab], remark: str
-) -> None:
+def write_grid(path: str | Path, arrays: Sequence[ArrayOfGrid], grid: Grid, slabs: Iterable[Slab], remark: str) -> None:
     """Writes arrays of which some layers along z are there at a time; see `save_grid`.
 
     Raises:
@@ -119,7 +116,7 @@ def write_grid(
         _FORMATS[Path(path).suffix.lower()](file, arrays, grid, slabs, remark)
 
 
-def require_grid_format(path: str | os.PathLike[str], names: Sequence[str]) -> None:
+def require_grid_format(path: str | Path, names: Sequence[str]) -> None:
     """Checks that a path names a file of a grid that holds arrays of some names.
 
     Raises:

@@ -33,7 +33,7 @@ class Grid:
 
     Attributes:
         origin: (3,) the first point, in world space.
-        spacing: (3,) distances of neighbouring points along the grid's axes, > 0; or one for all.
+        spacing: (3,) distances of neighbouring points along the grid's axes, > 0.
         shape: (3,) how many points there are along the axes.
         directions: (3, 3) rows are unit vectors along which the axes run in the world; None: along x, y and z.
         space: What the world's axes are, as NRRD calls it, such as "left-posterior-superior"; empty if unknown.
@@ -61,7 +61,9 @@ class Grid:
                 raise MeshError(f"The grid's {name} is {shown(value)}; pass its name.")
 
     @staticmethod
-    def around(mesh: TetMesh, spacing: Any = None, size: Any = None) -> Grid:
+    def around(
+        mesh: TetMesh, spacing: float | Sequence[float] | None = None, size: int | Sequence[int] | None = None
+    ) -> Grid:
         """A grid whose voxels fill the box around a mesh; their centres are its points.
 
         Args:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -61,11 +61,11 @@ class Sampling:
     def remark(self) -> str:
         """What the header of a file says of it."""
         mean = f"Means of {self.samples}^3 points a voxel.\n" if self.samples > 1 else ""
-        return f"{mean}Points outside of the mesh have the value {self.outside:g}."
+        return f"{mean}Points outside of the mesh have the value {self.outside!r}."
 
 
 def voxelise_to_file(
-    path: str | os.PathLike[str],
+    path: str | Path,
     mesh: TetMesh,
     values: torch.Tensor | Mapping[str, torch.Tensor],
     grid: Grid,
@@ -96,7 +96,7 @@ def voxelise_to_file(
 
 
 def write_sampled(
-    path: str | os.PathLike[str],
+    path: str | Path,
     arrays: Mapping[str, MeshValues],
     grid: Grid,
     sampling: Sampling,

@@ -6,7 +6,6 @@ colours behind places that MeshLab and Blender read, "StL Format" (3D Systems 19
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -55,7 +54,7 @@ class Surface:
 
 
 def save_surface(
-    path: str | os.PathLike[str],
+    path: str | Path,
     vertices: torch.Tensor,
     triangles: torch.Tensor,
     colors: torch.Tensor | None = None,
@@ -90,7 +89,7 @@ def save_surface(
         _FORMATS[Path(path).suffix.lower()](file, surface)
 
 
-def require_surface_format(path: str | os.PathLike[str]) -> None:
+def require_surface_format(path: str | Path) -> None:
     """Checks that a path names a file of a surface.
 
     Raises:
@@ -101,7 +100,7 @@ def require_surface_format(path: str | os.PathLike[str]) -> None:
 
 
 def _checked(
-    path: str | os.PathLike[str],
+    path: str | Path,
     vertices: torch.Tensor,
     triangles: torch.Tensor,
     colors: torch.Tensor | None,
