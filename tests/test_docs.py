@@ -18,7 +18,7 @@ PAGES = sorted(page for page in DOCS.rglob("*.md") if not {"_build", "gallery"} 
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *PAGES]
 TEXTS = {str(document.relative_to(ROOT)): document.read_text(encoding="utf-8") for document in DOCUMENTS}
 API = "".join(text for name, text in TEXTS.items() if name.startswith("docs/api"))
-PUBLIC = ("", ".mesh", ".mesh.io", ".optics", ".rendering", ".capture", ".fitting", ".view")
+PUBLIC = ("", ".mesh", ".mesh.io", ".optics", ".rendering", ".sampling", ".capture", ".fitting", ".view")
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT / "src"), "OMP_NUM_THREADS": "1"}
 
 # What a page takes for granted: here a folder of photographs called garden.

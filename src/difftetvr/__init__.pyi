@@ -47,8 +47,11 @@ from .rendering.quantities.normals import render_normals as render_normals
 from .rendering.rays import Rays as Rays
 from .rendering.rays import RaySource as RaySource
 from .rendering.scalar_field import ScalarField as ScalarField
+from .sampling.grid_files import save_grid as save_grid
 from .sampling.isosurfaces import isosurface as isosurface
 from .sampling.probing import probe as probe
+from .sampling.slabs import voxelise_to_file as voxelise_to_file
+from .sampling.surface_files import save_surface as save_surface
 from .sampling.voxels import voxelise as voxelise
 from .trust import trusting as trusting
 
@@ -91,7 +94,10 @@ __all__ = [
     "render",
     "render_normals",
     "save",
+    "save_grid",
+    "save_surface",
     "transmittance_at",
     "trusting",
     "voxelise",
+    "voxelise_to_file",
 ]

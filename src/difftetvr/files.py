@@ -7,6 +7,7 @@ import errno
 import os
 import re
 import secrets
+import shutil
 import stat
 import sys
 import warnings
@@ -101,6 +102,24 @@ def require_writable(path: str | os.PathLike[str], error: type[DiffTetError] = D
     try:
         _replaceable_mode(target)
         _probe(target)
+    except OSError as problem:
+        raise error(_sentence(path, problem)) from problem
+
+
+def require_room(path: str | os.PathLike[str], size: int, error: type[DiffTetError] = DiffTetError) -> None:
+    """Checks that a disk has room for a file before the time to make its content is spent.
+
+    Args:
+        path: The file to write. Its folder must exist.
+        size: Bytes.
+        error: The exception to raise.
+
+    Raises:
+        DiffTetError: (of type ``error``) There is less, or the folder cannot be looked at.
+    """
+    try:
+        if size > shutil.disk_usage(Path(os.path.realpath(path)).parent).free:
+            raise OSError(errno.ENOSPC, f"there is no room for its {size / 2**30:.3g} GiB")
     except OSError as problem:
         raise error(_sentence(path, problem)) from problem
 

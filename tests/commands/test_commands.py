@@ -167,7 +167,7 @@ def test_bad_input_is_one_sentence_and_code_2(run, tmp_path, capsys):
     fails(capsys, "eval", model, "tooth", *VIEWS, "--test-every", 0)
     fails(capsys, "info", tmp_path / "nothing.vtu")
     fails(capsys, "info", tmp_path / "broken.vtu")
-    fails(capsys, "export", model, tmp_path / "a.ply")
+    fails(capsys, "export", model, tmp_path / "a.off")
     fails(capsys, "export", tmp_path / "nothing.vtu", tmp_path / "a.vtk")
     assert {p.name for p in tmp_path.iterdir()} == {"broken.vtu", "short.raw", "file", "grid.vtu"}
 

@@ -75,7 +75,9 @@ def test_export_says_what_is_left_out(tmp_path, flat_mesh, capsys):
     output = capsys.readouterr().out
     assert "1 of 2 cells has no volume" in output
     assert "(1 cell, geometry only, without color, density, heat, pressure)" in output
-    assert "no format that holds" in fails(capsys, "export", flat_mesh, tmp_path / "a.ply")
+    sentence = fails(capsys, "export", flat_mesh, tmp_path / "a.off")
+    assert "'.off' is no format that is written; write a mesh (.vtu, " in sentence
+    assert "or a grid (.nrrd, .vti, .npy), or a surface (.ply, " in sentence
     hexahedron = tmp_path / "a.vtk"
     hexahedron.write_text(HEXAHEDRON)
     assert "1 cell of type 'hexahedron'; only linear" in fails(capsys, "export", hexahedron, tmp_path / "b.vtu")

@@ -15,6 +15,7 @@ from torch import Tensor
 from difftetvr import isosurface, probe
 from difftetvr.errors import MeshError
 from difftetvr.mesh import TetMesh
+from difftetvr.sampling.isosurfaces import at_vertices, crossed_edges
 
 
 def sides(triangles: Tensor) -> Counter[tuple[int, int]]:
@@ -86,6 +87,29 @@ def test_levels_out_of_reach_have_no_surface() -> None:
     places, triangles = isosurface(mesh, mesh.vertices[:, 0], 2.0)
     assert places.shape == (0, 3)
     assert triangles.shape == (0, 3)
+
+
+def test_other_values_on_a_surface_are_those_of_probes() -> None:
+    generator = torch.Generator().manual_seed(3)
+    mesh = TetMesh.delaunay(torch.rand(40, 3, generator=generator, dtype=torch.float64))
+    scalar = torch.rand(mesh.num_vertices, generator=generator, dtype=torch.float64)
+    colors = torch.rand(mesh.num_vertices, 3, generator=generator, dtype=torch.float64)
+    edges = crossed_edges(mesh, scalar, 0.5)
+    assert torch.equal(edges.interpolated(mesh.vertices), isosurface(mesh, scalar, 0.5)[0])
+    assert float((edges.interpolated(scalar) - 0.5).abs().max()) < 1e-12
+    expected = probe(mesh, colors, edges.interpolated(mesh.vertices))
+    assert float((edges.interpolated(colors) - expected).abs().max()) < 1e-9
+
+
+def test_means_at_vertices_are_weighted_by_volume() -> None:
+    generator = torch.Generator().manual_seed(4)
+    mesh = TetMesh.delaunay(torch.rand(20, 3, generator=generator, dtype=torch.float64))
+    values = torch.rand(mesh.num_cells, 2, generator=generator, dtype=torch.float64)
+    found = at_vertices(mesh, values)
+    for vertex in range(mesh.num_vertices):
+        around = (mesh.tets == vertex).any(1)
+        volumes = mesh.volumes()[around, None]
+        assert torch.allclose(found[vertex], (volumes * values[around]).sum(0) / volumes.sum())
 
 
 @pytest.mark.parametrize(

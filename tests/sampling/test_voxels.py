@@ -83,7 +83,7 @@ def test_large_grids_are_made_in_slabs(monkeypatch: pytest.MonkeyPatch) -> None:
     values = torch.rand(mesh.num_vertices, dtype=torch.float64)
     arguments: tuple[Any, ...] = (mesh, values, (0.0, 0.0, 0.0), 0.07, (13, 11, 12))
     whole = voxelise(*arguments)
-    monkeypatch.setattr("difftetvr.sampling.voxels._AT_ONCE", 300)
+    monkeypatch.setattr("difftetvr.sampling.voxels.AT_ONCE", 300)
     assert torch.allclose(voxelise(*arguments), whole, atol=1e-12)
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 
@@ -20,8 +20,7 @@ from difftetvr.declared import require_declared
 from difftetvr.errors import CaptureError, shown
 from difftetvr.inputs import as_number, as_reals, require_type
 from difftetvr.rendering.cameras.pinhole import Camera
-
-Encoding = Literal["linear", "srgb"]
+from difftetvr.srgb import Encoding
 
 # The attenuation of the published volume experiments, for a box whose longest side is 1.
 _DEFAULT_ATTENUATION = 25.0

@@ -33,7 +33,7 @@ COMMANDS = {
     "cut": "pictures.Cut",
     "eval": "files.Eval",
     "info": "files.Info",
-    "export": "files.Export",
+    "export": "export.command.Export",
     "doctor": "doctor.Doctor",
 }
 """Modules and dataclasses of the commands, within this package."""
@@ -49,7 +49,7 @@ def command_type(name: str) -> type:
         alike = difflib.get_close_matches(name, COMMANDS, 1)
         hint = f"; is it '{alike[0]}'?" if alike else f"; give one of {', '.join(COMMANDS)}."
         raise FitError(f"There is no command '{name}'{hint}")
-    module, _, kind = COMMANDS[name].partition(".")
+    module, _, kind = COMMANDS[name].rpartition(".")
     found: type = getattr(importlib.import_module(f"difftetvr.cli.{module}"), kind)
     return found
 

@@ -1,8 +1,7 @@
-"""The commands that look at files and write other ones: ``difftetvr eval | info | export``."""
+"""The commands that look at files: ``difftetvr eval | info``."""
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,7 +11,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from difftetvr.cli.arguments import Groups
 from difftetvr.cli.options import CAPTURE_GROUPS, CaptureOptions, Color, MeshOptions, TrustOptions, color_of, load_model
-from difftetvr.errors import FitError, MeshError, counted, listed
+from difftetvr.errors import FitError
 from difftetvr.files import require_writable
 from difftetvr.fitting.records.folder import RunFolder, write_json
 
@@ -97,49 +96,6 @@ class Info:
             console.print(table_of_data)
         if (table_of_run := _run_of(path)) is not None:
             console.print(table_of_run)
-
-
-@dataclass(frozen=True)
-class Export:
-    """Write a mesh with its data, color and density among them if it has them, in another format."""
-
-    model: Annotated[Path, Positional, arg(metavar="MODEL")]
-    """Mesh, in any format that is read."""
-    output: Annotated[Path, Positional, arg(metavar="OUT")]
-    """File to write: .vtu, .vtk, .msh, .xdmf, .npz, .bintet, .ovm or .node with its .ele; .mesh with --geometry."""
-    geometry: bool = False
-    """Leave out color, density and all other data."""
-    without_harmonics: bool = False
-    """Leave out what colours owe to the direction, which only .vtu and .npz can hold."""
-    reading: OmitArgPrefixes[MeshOptions] = field(default_factory=MeshOptions)
-    trust: OmitArgPrefixes[TrustOptions] = field(default_factory=TrustOptions)
-
-    def run(self, console: Console) -> None:
-        """Reads and writes."""
-        from difftetvr.mesh.io import FIELD_ARRAYS, HARMONICS, holds_data, require_writable_format, save
-
-        require_writable_format(self.output, with_field=False)
-        require_writable(self.output, MeshError)
-        data = self.reading.load(self.model, console, only_draws=False)
-        field_on_mesh = None if self.geometry else data.field
-        if field_on_mesh is not None and self.without_harmonics:
-            field_on_mesh = dataclasses.replace(field_on_mesh, harmonics=None)
-        if field_on_mesh is not None:
-            require_writable_format(self.output)
-        written = () if field_on_mesh is None else FIELD_ARRAYS
-        if field_on_mesh is not None and field_on_mesh.harmonics is not None:
-            written = (*written, HARMONICS)
-        of_field = (*FIELD_ARRAYS, HARMONICS) if data.field is not None else ()
-        others = [{n: v for n, v in d.items() if n not in of_field} for d in (data.point_data, data.cell_data)]
-        if self.geometry or not holds_data(self.output):
-            others = [{}, {}]
-        names = data.group_names if any(others) else {}
-        save(self.output, data.mesh, field_on_mesh, point_data=others[0], cell_data=others[1], group_names=names)
-        written = (*written, *sorted({*others[0], *others[1]}))
-        left_out = sorted({*data.point_data, *data.cell_data}.difference(written))
-        content = listed(written) if written else "geometry only"
-        without = f", without {', '.join(left_out)}" if left_out else ""
-        console.print(f"Wrote {self.output} ({counted(data.mesh.num_cells, 'cell')}, {content}{without})")
 
 
 def _run_of(path: Path) -> Table | None:

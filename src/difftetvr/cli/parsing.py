@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import difflib
 import io
+import itertools
 import types
 import typing
 from collections.abc import Sequence
@@ -176,7 +177,8 @@ def _positionals_first(kind: type, args: Sequence[str]) -> list[str]:
     left = list(args)
     moved: list[str] = []
     for at in reversed([i for i, word in enumerate(left) if word in several]):
-        words = 1 if left[at + 1 : at + 2] and not _is_number(left[at + 1]) else several[left[at]]
+        numbers = list(itertools.takewhile(_is_number, left[at + 1 : at + 1 + several[left[at]]]))
+        words = max(1, len(numbers))
         moved[:0] = left[at : at + 1 + words]
         del left[at : at + 1 + words]
     return left + moved

@@ -100,6 +100,17 @@ def saved_run(args: Sequence[str]) -> SavedRun | None:
     return dataclasses.replace(saved, capture=None)
 
 
+def saved_beside(model: Path) -> SavedRun | None:
+    """The run that a model is the result of; None where it does not lie in the folder of one, or that is damaged."""
+    folder = RunFolder(model.parent)
+    if model.name != folder.model.name:
+        return None
+    try:
+        return SavedRun.in_folder(folder)
+    except DiffTetError:
+        return None
+
+
 def _read(path: Path, base: dict[str, Any], refusal: str) -> SavedRun:
     """A run's options from JSON.
 

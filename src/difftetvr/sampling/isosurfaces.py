@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
@@ -33,6 +33,37 @@ def isosurface(mesh: TetMesh, scalar: torch.Tensor, level: float | torch.Tensor)
     Raises:
         MeshError: There is not one finite scalar for each vertex, or the level is no finite number.
     """
+    found = crossed_edges(mesh, scalar, level)
+    return found.interpolated(mesh.positions if any(mesh.origin) else mesh.vertices), found.triangles
+
+
+class CrossedEdges(NamedTuple):
+    """Edges of a mesh on which a scalar has a level, each a vertex of the surface.
+
+    Attributes:
+        begin: (P,) int64 vertices of the mesh at which the edges begin.
+        end: (P,) those at which they end.
+        share: (P,) how far along each the level is, in [0, 1]; differentiable.
+        triangles: (M, 3) int64 edges that triangles join.
+    """
+
+    begin: torch.Tensor
+    end: torch.Tensor
+    share: torch.Tensor
+    triangles: torch.Tensor
+
+    def interpolated(self, values: torch.Tensor) -> torch.Tensor:
+        """(P, ...) values at the places on the edges, of (V, ...) values of the mesh's vertices; differentiable."""
+        share = self.share.reshape(-1, *[1] * (values.ndim - 1))
+        return values[self.begin] + share * (values[self.end] - values[self.begin])
+
+
+def crossed_edges(mesh: TetMesh, scalar: torch.Tensor, level: float | torch.Tensor) -> CrossedEdges:
+    """Where a scalar has a level, as `isosurface` has it, to take other values there, too.
+
+    Raises:
+        MeshError: As `isosurface`.
+    """
     table, _ = checked_values(mesh, scalar, "vertex")
     if table.shape[1] != 1:
         raise MeshError(f"There are {table.shape[1]} values for each vertex; pass one scalar, (V,).")
@@ -49,9 +80,18 @@ def isosurface(mesh: TetMesh, scalar: torch.Tensor, level: float | torch.Tensor)
     triangles = _triangles(above[mesh.tets.long()], cell_edges(mesh.topology).long())
     begin, end = edges[is_cut].unbind(1)
     share = (height - values[begin]) / (values[end] - values[begin])
-    positions = mesh.positions if any(mesh.origin) else mesh.vertices
-    places = positions[begin] + share[:, None] * (positions[end] - positions[begin])
-    return places, number[triangles]
+    return CrossedEdges(begin, end, share, number[triangles])
+
+
+def at_vertices(mesh: TetMesh, values: torch.Tensor) -> torch.Tensor:
+    """(V, ...) means of the (T, ...) values of the cells around each vertex, weighted by volume."""
+    volumes = mesh.volumes().to(values.dtype)
+    weights = (volumes / volumes.amax()).reshape(-1, *[1] * (values.ndim - 1))
+    total, weight = (part.new_zeros((mesh.num_vertices, *part.shape[1:])) for part in (values, weights))
+    for corner in mesh.tets.long().unbind(1):
+        total.index_add_(0, corner, weights * values)
+        weight.index_add_(0, corner, weights)
+    return total / weight
 
 
 def _triangles(above: torch.Tensor, edges: torch.Tensor) -> torch.Tensor:

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 
-from difftetvr.errors import MeshError, shown
+from difftetvr.errors import MeshError
 from difftetvr.inputs import as_number, as_reals, as_whole
 from difftetvr.mesh import TetMesh
 from difftetvr.mesh.field import Location
+from difftetvr.sampling.grids import checked_lattice
 from difftetvr.sampling.location import Lattice, locate_lattice
 from difftetvr.sampling.probing import checked_values, interpolated
 
-MOST_VOXELS = 1 << 31
-_AT_ONCE = 1 << 22  # points whose values are interpolated at a time
+_MOST_SAMPLES = 16
+AT_ONCE = 1 << 22
+"""Points whose values are interpolated at a time."""
 
 
 def voxelise(
@@ -50,11 +50,13 @@ def voxelise(
         BackendError: No back end runs on the device of the vertices.
     """
     table, where = checked_values(mesh, values, location)
-    lattice, samples = _lattice(origin, spacing, shape, samples)
+    lattice = checked_lattice(origin, spacing, shape)
+    samples = as_whole(samples, "samples", MeshError)
+    require_samples(samples)
     filler = as_number(outside, "outside", MeshError)
     shift = mesh.origin
     slabs = []
-    rows = max(1, _AT_ONCE // (lattice.shape[1] * lattice.shape[2] * samples**3))
+    rows = max(1, AT_ONCE // (lattice.shape[1] * lattice.shape[2] * samples**3))
     for first in range(0, lattice.shape[0], rows):
         count = min(rows, lattice.shape[0] - first)
         fine = _refined(lattice, first, count, samples, shift)
@@ -68,32 +70,14 @@ def voxelise(
     return grid.reshape(*lattice.shape, *as_reals(values, "The values", MeshError).shape[1:])
 
 
-def _lattice(origin: Any, spacing: Any, shape: Any, samples: Any) -> tuple[Lattice, int]:
-    """The checked grid.
+def require_samples(samples: int) -> None:
+    """Checks how finely voxels are divided for a mean.
 
     Raises:
-        MeshError: An argument is out of range.
+        MeshError: The number is not in [1, 16].
     """
-    first, step = (
-        as_reals(value, name, MeshError, torch.float64, "pass three numbers").detach().double().reshape(-1).tolist()
-        for name, value in (("origin", origin), ("spacing", spacing))
-    )
-    step = step * 3 if len(step) == 1 else step
-    if len(first) != 3 or not all(math.isfinite(x) for x in first):
-        raise MeshError(f"origin is {shown(origin)}; pass three finite numbers.")
-    if len(step) != 3 or not all(math.isfinite(x) and x > 0 for x in step):
-        raise MeshError(f"spacing is {shown(spacing)}; pass one or three finite numbers greater than 0.")
-    try:
-        counts = [as_whole(n, "shape", MeshError, "pass three whole numbers") for n in shape]
-    except TypeError as reason:
-        raise MeshError(f"shape is {shown(shape)}; pass three whole numbers.") from reason
-    samples = as_whole(samples, "samples", MeshError)
-    if len(counts) != 3 or min(counts) < 1 or math.prod(counts) > MOST_VOXELS:
-        raise MeshError(f"shape is {shown(shape)}; pass three numbers of voxels, at most {MOST_VOXELS:,} in all.")
-    if not 1 <= samples <= 16:
-        raise MeshError(f"samples is {samples}; pass a number from 1 to 16.")
-    (x, y, z), (dx, dy, dz), (nx, ny, nz) = first, step, counts
-    return Lattice((x, y, z), (dx, dy, dz), (nx, ny, nz)), samples
+    if not 1 <= samples <= _MOST_SAMPLES:
+        raise MeshError(f"samples is {samples}; pass a number from 1 to {_MOST_SAMPLES}.")
 
 
 def _refined(lattice: Lattice, first: int, count: int, samples: int, shift: Sequence[float]) -> Lattice:

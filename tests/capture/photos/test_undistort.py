@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from difftetvr.capture.photos.lens import Distortion, Intrinsics
-from difftetvr.capture.photos.undistort import linear_to_srgb, pinhole_of, srgb_to_linear, undistorted, undistorted_mask
+from difftetvr.capture.photos.undistort import pinhole_of, undistorted, undistorted_mask
 from difftetvr.errors import CaptureError
+from difftetvr.srgb import linear_to_srgb, srgb_to_linear
 
 LENSES = {
     "barrel": Distortion(k1=-0.2, k2=0.03),

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 import difftetvr as dtv
-from difftetvr.mesh.io import MeshData, load_data, scalar_of
+from difftetvr.mesh.io import MeshData, array_names, array_of, load_data, scalar_of
 
 MESH = dtv.TetMesh.grid((2, 2, 2))
 POINTS, CELLS = MESH.num_vertices, MESH.num_cells
@@ -113,3 +113,30 @@ def test_integers_over_their_whole_range_and_small_ones():
     assert found.values[0] == 0.0 and found.values[1] == 2.0**64
     found = scalar_of(data_of({"p": torch.arange(POINTS) + 2**53 - POINTS + 1}))
     assert found.offset == 0 and found.values[-1] == 2.0**53 and found.counted_from_offset(0.1) == 0.1
+
+
+def test_arrays_keep_their_components():
+    velocity, stress = torch.rand(POINTS, 3), torch.rand(CELLS, 3, 3)
+    data = data_of({"v": velocity, "p": torch.rand(POINTS)}, {"s": stress, "p": torch.arange(CELLS)})
+    assert array_names(data) == ["v", "point:p", "s", "cell:p"]
+    assert [tuple(array_of(data, name).values.shape) for name in array_names(data)] == [
+        *((POINTS, 3), (POINTS,), (CELLS, 9), (CELLS,))
+    ]
+    assert torch.equal(array_of(data, "v").values, velocity) and array_of(data, "v").name == "v"
+    assert torch.equal(array_of(data, "s").values, stress.flatten(1))
+    assert torch.equal(array_of(data, "v:x").values, velocity[:, 0])
+    assert torch.equal(array_of(data, "v:magnitude").values, scalar_of(data, "v").values)
+    with pytest.raises(dtv.MeshError, match="several scalars"):
+        array_of(data)
+    assert array_of(data_of({"v": velocity})).name == "v"
+
+
+def test_cells_without_all_of_a_vector_are_left_out():
+    velocity = torch.rand(POINTS, 3)
+    velocity[5, 1] = torch.nan
+    found = array_of(data_of({"v": velocity}), "v")
+    assert found.missing == int((MESH.tets == 5).any(1).sum()) > 0
+    assert found.mesh.num_cells == CELLS - found.missing
+    assert torch.equal(found.values, velocity[found.vertices])
+    assert torch.equal(found.mesh.vertices, MESH.vertices[found.vertices])
+    assert array_of(data_of({"v": velocity}), "v:x").vertices is None

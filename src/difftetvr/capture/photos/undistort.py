@@ -9,8 +9,7 @@ import torch
 
 from difftetvr.capture.photos.lens import Intrinsics
 from difftetvr.errors import CaptureError
-
-_SRGB_KNEE, _LINEAR_KNEE = 0.04045, 0.0031308
+from difftetvr.srgb import linear_to_srgb, srgb_to_linear
 
 
 def pinhole_of(lens: Intrinsics, where: str) -> Intrinsics:
@@ -83,18 +82,6 @@ def undistorted_mask(mask: torch.Tensor, lens: Intrinsics, pinhole: Intrinsics) 
     wrong = torch.nn.functional.max_pool2d((~mask).float()[None, None], 5, stride=1, padding=2)
     grid = _sampling_grid(lens, pinhole)
     return torch.nn.functional.grid_sample(wrong, grid, mode="nearest", align_corners=False)[0, 0] == 0
-
-
-def srgb_to_linear(values: torch.Tensor) -> torch.Tensor:
-    """Linear light from sRGB-encoded values (IEC 61966-2-1)."""
-    return torch.where(values <= _SRGB_KNEE, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
-
-
-def linear_to_srgb(values: torch.Tensor) -> torch.Tensor:
-    """sRGB-encoded values from linear light (IEC 61966-2-1)."""
-    return torch.where(
-        values <= _LINEAR_KNEE, values * 12.92, 1.055 * values.clamp(min=_LINEAR_KNEE) ** (1 / 2.4) - 0.055
-    )
 
 
 # The photographs of one camera share a grid; it is large, so few are kept.

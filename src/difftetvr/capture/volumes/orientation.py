@@ -30,15 +30,8 @@ def in_world_axes(raw: RawVolume, source: str | Path) -> RawVolume:
     """
     if raw.directions is None:
         return raw
-    angles = np.abs(raw.directions @ raw.directions.T - np.eye(3))
-    if angles.max() > _ROUNDING:
-        a, b = np.unravel_index(angles.argmax(), angles.shape)
-        degrees = np.degrees(np.arccos(np.clip(raw.directions[a] @ raw.directions[b], -1.0, 1.0)))
-        raise CaptureError(
-            f"The axes {'xyz'[a]} and {'xyz'[b]} of '{source}' meet at {degrees:.4g} degrees; resample it to a grid "
-            "with right angles."
-        )
-    axes, signs = _nearest_axes(raw.directions)
+    require_right_angles(raw.directions, source)
+    axes, signs = nearest_axes(raw.directions)
     # values[z, y, x]: axis a of the file is dimension 2 - a.
     values = raw.values.transpose([2 - axes.index(axis) for axis in (2, 1, 0)])
     values = np.flip(values, tuple(2 - axes[a] for a in range(3) if signs[a] < 0))
@@ -46,7 +39,27 @@ def in_world_axes(raw: RawVolume, source: str | Path) -> RawVolume:
     return RawVolume(values, (x, y, z), None, (*raw.notes, *_tilt(raw.directions, axes, source)))
 
 
-def _nearest_axes(directions: np.ndarray) -> tuple[tuple[int, ...], tuple[int, ...]]:
+def require_right_angles(directions: np.ndarray, source: str | Path) -> None:
+    """Checks that a file's axes are at right angles.
+
+    Args:
+        directions: (3, 3) the axes, as `RawVolume` has them.
+        source: The file, for the sentence.
+
+    Raises:
+        CaptureError: They are not.
+    """
+    angles = np.abs(directions @ directions.T - np.eye(3))
+    if angles.max() > _ROUNDING:
+        a, b = np.unravel_index(angles.argmax(), angles.shape)
+        degrees = np.degrees(np.arccos(np.clip(directions[a] @ directions[b], -1.0, 1.0)))
+        raise CaptureError(
+            f"The axes {'xyz'[a]} and {'xyz'[b]} of '{source}' meet at {degrees:.4g} degrees; resample it to a grid "
+            "with right angles."
+        )
+
+
+def nearest_axes(directions: np.ndarray) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """For each axis of the file the world's axis it runs along, and in which sense: 1 or -1."""
     handedness = np.linalg.det(directions)
     choices = [

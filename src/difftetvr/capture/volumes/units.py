@@ -38,10 +38,12 @@ class Distances(NamedTuple):
     Attributes:
         values: Three numbers, as parsed.
         notes: What was converted or assumed, a sentence each.
+        unit: The unit; empty where it is not known.
     """
 
     values: tuple[float, float, float]
     notes: tuple[str, ...] = ()
+    unit: str = ""
 
 
 def in_one_unit(
@@ -58,7 +60,7 @@ def in_one_unit(
     x, y, z = values
     names = [name.strip().translate(_SAME_LETTERS) for name in units]
     if len(set(names)) == 1:
-        return Distances((x, y, z))
+        return Distances((x, y, z), unit=names[0])
     found = f"The distances of samples in '{source}' are given in {listed(_distinct(names))}"
     lengths = [_METRES.get(name) for name in names]
     common = _METRES.get(unit or names[0])
@@ -69,7 +71,9 @@ def in_one_unit(
             (f"{found}, which cannot be compared; they are taken as equal, unless --spacing says otherwise.",),
         )
     x, y, z = (value * factor for value, factor in zip(values, factors, strict=True))
-    return Distances((x, y, z), (f"{found}; all are taken in {unit or names[0]}: {x:.6g} x {y:.6g} x {z:.6g}.",))
+    common_unit = unit or names[0]
+    note = f"{found}; all are taken in {common_unit}: {x:.6g} x {y:.6g} x {z:.6g}."
+    return Distances((x, y, z), (note,), common_unit)
 
 
 def filled(values: Sequence[float | None], source: str | Path) -> Distances:

@@ -23,7 +23,7 @@ from difftetvr.rendering.cameras.pinhole import Camera
 from difftetvr.trust import require_free
 
 TOOTH = "tooth"
-_TOOTH_VOLUME = "tooth_103x94x161_uint8.raw.xz"
+TOOTH_VOLUME = "tooth_103x94x161_uint8.raw.xz"
 _TOOTH_TRANSFER_FUNCTION = "tooth3gauss.json"
 # What would be stored as 0 in every picture of 8 bits.
 _LEAST_SEEN = 0.5 / 255.0
@@ -115,7 +115,7 @@ class VolumeCapture:
         if self.path == TOOTH:
             if self.shape is not None or self.dtype is not None:
                 raise CaptureError("The packaged tooth says itself what it holds; leave out the shape and the dtype.")
-            with _packaged(_TOOTH_VOLUME) as volume_file, _packaged(_TOOTH_TRANSFER_FUNCTION) as function_file:
+            with packaged(TOOTH_VOLUME) as volume_file, packaged(_TOOTH_TRANSFER_FUNCTION) as function_file:
                 volume = Volume.load(volume_file, None, None, self.spacing, self.value_range)
                 return volume, TransferFunction.load(self.transfer_function or function_file)
         if self.transfer_function is None:
@@ -162,6 +162,7 @@ class VolumeCapture:
 
 
 @contextmanager
-def _packaged(name: str) -> Iterator[Path]:
+def packaged(name: str) -> Iterator[Path]:
+    """Context in which a file that the package carries has a path."""
     with resources.as_file(resources.files("difftetvr") / "data" / name) as path:
         yield path

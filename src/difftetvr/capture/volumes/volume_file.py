@@ -18,6 +18,21 @@ _SHORTEST_PRINTED = 60
 _TEXT_BLOCK = 2**22
 
 
+class World(NamedTuple):
+    """Where a volume lies in the world of its file.
+
+    Attributes:
+        origin: Place of the first sample, in the unit of the distances of samples; 0 where the file does not tell.
+        space: What the world's axes are, as NRRD calls it, such as "left-posterior-superior"; empty where the file does
+            not tell.
+        unit: Unit of length, as the file calls it; empty where it does not tell.
+    """
+
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    space: str = ""
+    unit: str = ""
+
+
 class RawVolume(NamedTuple):
     """A volume as a file stores it.
 
@@ -27,12 +42,14 @@ class RawVolume(NamedTuple):
         directions: (3, 3) float64, row a is the unit vector in a right-handed world along which the file's axis a
             (0 for x) runs; None where the file's axes are the world's.
         notes: What a reader chose or passed over, a sentence each.
+        world: Where the samples lie in a right-handed world.
     """
 
     values: np.ndarray
     spacing: tuple[float, float, float]
     directions: np.ndarray | None = None
     notes: tuple[str, ...] = ()
+    world: World = World()
 
 
 def parse_shape(numbers: Sequence[int | str], source: str | Path) -> tuple[int, int, int]:
@@ -84,6 +101,13 @@ def parse_steps(steps: Sequence[Sequence[float]], source: str | Path) -> tuple[t
         given = _joined([f"({_joined(step)})" for step in steps])
         raise CaptureError(f"'{source}' gives the axes '{given}'; it needs three vectors that differ from 0.")
     return (lengths[0], lengths[1], lengths[2]), np.array(steps, dtype=np.float64) / np.array(lengths)[:, None]
+
+
+def parse_origin(numbers: Sequence[float]) -> tuple[float, float, float]:
+    """The first three numbers; all 0 where there are fewer, or one is not finite, so that the file tells no place."""
+    if len(numbers) < 3 or not all(math.isfinite(x) for x in numbers[:3]):
+        return 0.0, 0.0, 0.0
+    return numbers[0], numbers[1], numbers[2]
 
 
 def parse_numbers(words: Sequence[float | str]) -> list[float]:

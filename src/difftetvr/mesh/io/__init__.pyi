@@ -25,6 +25,8 @@ from .saving import holds_data as holds_data
 from .saving import require_writable_format as require_writable_format
 from .saving import save as save
 from .scalars import Scalar as Scalar
+from .scalars import array_names as array_names
+from .scalars import array_of as array_of
 from .scalars import missing_note as missing_note
 from .scalars import scalar_of as scalar_of
 
@@ -39,6 +41,8 @@ __all__ = [
     "MeshWarning",
     "Scalar",
     "Storable",
+    "array_names",
+    "array_of",
     "holds_data",
     "is_mesh_archive",
     "load",

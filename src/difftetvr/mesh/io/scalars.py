@@ -30,16 +30,18 @@ _LARGEST_EXACT = 2**53
 
 @dataclass(frozen=True)
 class Scalar:
-    """One number for each vertex or cell of a mesh.
+    """One number for each vertex or cell of a mesh, or a vector of them where `array_of` was asked for one.
 
     Attributes:
         name: What it is called, with its component: ``T``, ``velocity:x``, ``magnitude of velocity``.
         mesh: The mesh; without the cells that have no value.
-        values: (V,) or (T,) finite numbers, components in the precision of the file, else float64.
+        values: (V,) or (T,) finite numbers, components in the precision of the file, else float64; (V, C) or (T, C) of
+            vectors.
         location: Where they live.
         missing: Number of cells that were left out, as a number of theirs is not finite.
         offset: What was taken off the values: the least of integers that float64 does not hold, such as times in
             nanoseconds; else 0.
+        vertices: (V,) int64 rows of the file's point data that are those of the mesh's vertices; None: all, in order.
     """
 
     name: str
@@ -48,6 +50,7 @@ class Scalar:
     location: Location
     missing: int = 0
     offset: int = 0
+    vertices: torch.Tensor | None = None
 
     def counted_from_offset(self, value: float) -> float:
         """A number of the file's as `values` have it, without rounding in between."""
@@ -71,17 +74,53 @@ def scalar_of(data: MeshData, name: str | None = None) -> Scalar:
     Raises:
         MeshError: There is no such scalar, several may be meant, or none of its numbers is finite.
     """
+    place, base, component, table = _chosen(data, name)
+    values, label = _component(table, base, component)
+    return _scalar(data, label, values, place)
+
+
+def array_of(data: MeshData, name: str | None = None) -> Scalar:
+    """Data of a file as they are, with all components of vectors and tensors.
+
+    Args:
+        data: The file's content.
+        name: As for `scalar_of`; without a component it means all of them.
+
+    Returns:
+        The numbers. Cells with one that is not finite are taken out of the mesh.
+
+    Raises:
+        MeshError: As for `scalar_of`.
+    """
+    place, base, component, table = _chosen(data, name)
+    if component is None:
+        return _scalar(data, base, table, place)
+    values, label = _component(table, base, component)
+    return _scalar(data, label, values, place)
+
+
+def array_names(data: MeshData) -> list[str]:
+    """Names of all data of a file, by which `array_of` finds each."""
+    found = _candidates(data)
+    return [_label(place, name, found) for place, name in found]
+
+
+def _chosen(data: MeshData, name: str | None) -> tuple[Location, str, str | None, torch.Tensor]:
+    """Place, name, wanted component and numbers of the data that a name means."""
     found = _candidates(data)
     if not found:
         raise MeshError("there are no scalars to show; add point or cell data, or color and density.")
     names = ", ".join(sorted({_label(place, n, found) for place, n in found}))
-    if name is None:
-        if len(found) > 1:
-            raise MeshError(f"there are several scalars ({names}); choose one with --scalar.")
-        (place, base), component = next(iter(found)), None
-    else:
+    if name is not None:
         place, base, component = _parsed(name, found, names)
-    values, label = _component(found[place, base], base, component)
+        return place, base, component, found[place, base]
+    if len(found) > 1:
+        raise MeshError(f"there are several scalars ({names}); choose one with --scalar.")
+    ((place, base), table) = next(iter(found.items()))
+    return place, base, None, table
+
+
+def _scalar(data: MeshData, label: str, values: torch.Tensor, place: Location) -> Scalar:
     numbers, offset = _numbers(values)
     return _without_missing(Scalar(label, data.mesh, numbers, place, offset=offset))
 
@@ -192,6 +231,7 @@ def _diagonal(columns: torch.Tensor) -> tuple[int, int, int]:
 
 def _without_missing(scalar: Scalar) -> Scalar:
     finite = torch.isfinite(scalar.values)
+    finite = finite.all(1) if finite.dim() > 1 else finite
     if finite.all():
         return scalar
     mesh = scalar.mesh
@@ -200,7 +240,7 @@ def _without_missing(scalar: Scalar) -> Scalar:
         raise MeshError(f"the scalar '{scalar.name}' is finite in no cell; name another with --scalar.")
     rest, used = cells_of(mesh, true_indices(kept))
     values = scalar.values[kept] if scalar.location == "cell" else scalar.values[used]
-    return replace(scalar, mesh=rest, values=values, missing=int((~kept).sum()))
+    return replace(scalar, mesh=rest, values=values, missing=int((~kept).sum()), vertices=used)
 
 
 def missing_note(scalar: Scalar) -> str | None:

@@ -16,8 +16,10 @@ from difftetvr.capture.volumes.readers.detached import data_files
 from difftetvr.capture.volumes.stored import AT_END, Stored, first_bytes, read_parts
 from difftetvr.capture.volumes.volume_file import (
     RawVolume,
+    World,
     byte_count,
     parse_numbers,
+    parse_origin,
     parse_shape,
     parse_steps,
     scaled,
@@ -43,7 +45,9 @@ _TYPES = {
 }
 # Names that one thing has had in the course of the years, the newest first.
 _DIRECTIONS = ("transformmatrix", "rotation", "orientation")
+_ORIGIN = ("offset", "position", "origin")
 _SPACING = ("elementspacing", "elementsize")
+_SPACE = "left-posterior-superior"  # as ITK takes it
 _BYTE_ORDER = ("elementbyteordermsb", "binarydatabyteordermsb")
 
 
@@ -76,7 +80,8 @@ def read_metaimage(path: Path) -> RawVolume:
     else:
         text = b"\n".join(part.read_text(math.prod(shape) // len(parts)) for part in parts)
         values = text_to_volume(text, shape, dtype, path)
-    return RawVolume(scaled(values, *scale, path), spacing, directions)
+    world = World(parse_origin(parse_numbers(_first(fields, _ORIGIN, "").split())), _SPACE)
+    return RawVolume(scaled(values, *scale, path), spacing, directions, world=world)
 
 
 def _read_header(path: Path) -> tuple[dict[str, str], list[str], int]:

@@ -14,9 +14,20 @@ import numpy as np
 
 from difftetvr.capture.volumes.readers.packages import package
 from difftetvr.capture.volumes.stored import Encoding, Stored, first_bytes
-from difftetvr.capture.volumes.volume_file import RawVolume, byte_count, parse_steps, scaled, three_axes, to_volume
+from difftetvr.capture.volumes.volume_file import (
+    RawVolume,
+    World,
+    byte_count,
+    parse_origin,
+    parse_steps,
+    scaled,
+    three_axes,
+    to_volume,
+)
 from difftetvr.errors import CaptureError
 
+_SPACE = "right-anterior-superior"
+_UNITS = {1: "m", 2: "mm", 3: "um"}  # by the lowest three bits of xyzt_units
 # Bytes of the header, with which it begins: for version 1 and 2.
 _CLASSES = {348: "Nifti1Header", 540: "Nifti2Header"}
 
@@ -33,7 +44,7 @@ def read_nifti(path: Path) -> RawVolume:
         header = _header(nibabel, first_bytes(path, max(_CLASSES), encoding))
         dtype, sizes = header.get_data_dtype(), [int(n) for n in header.get_data_shape()]
         slope, intercept, notes = _scale(path, header)
-        steps = _steps(header)
+        affine, world = _affine(header)
         start = int(header.get_data_offset())
     except CaptureError:
         raise
@@ -46,10 +57,10 @@ def read_nifti(path: Path) -> RawVolume:
     while len(sizes) > 3 and sizes[-1] == 1:
         sizes.pop()
     shape = three_axes(sizes, path)
-    spacing, directions = parse_steps(steps, path)
+    spacing, directions = parse_steps(affine[:3, :3].T.tolist(), path)
     size = byte_count(shape, dtype)
     values = to_volume(Stored(path, encoding, skip=max(start, 0)).read(size)[:size], shape, dtype, path)
-    return RawVolume(scaled(values, slope, intercept, path), spacing, directions, notes)
+    return RawVolume(scaled(values, slope, intercept, path), spacing, directions, notes, world)
 
 
 def _header(nibabel: Any, data: bytes) -> Any:
@@ -75,13 +86,15 @@ def _scale(path: Path, header: Any) -> tuple[float, float, tuple[str, ...]]:
     return slope, 0.0, (f"The intercept of '{path}' is {intercept}; it is taken as 0, with the slope {slope:.6g}.",)
 
 
-def _steps(header: Any) -> list[list[float]]:
-    """From a sample to the next along each axis, in the order that the format's definition prefers."""
+def _affine(header: Any) -> tuple[np.ndarray, World]:
+    """(4, 4) float64 from indices to the world, by what the format's definition prefers, and what that tells."""
+    unit = _UNITS.get(int(header["xyzt_units"]) & 7, "")
     if header["sform_code"] > 0:
         affine = header.get_sform()
     elif header["qform_code"] > 0:
         affine = header.get_qform()
     else:
         # nibabel would reverse x here, as SPM did for Analyze files; the definition of NIfTI does not.
-        affine = np.diag([abs(float(size)) for size in header["pixdim"][1:4]])
-    return affine[:3, :3].T.astype(np.float64).tolist()
+        return np.diag([*(abs(float(size)) for size in header["pixdim"][1:4]), 1.0]), World(unit=unit)
+    affine = affine.astype(np.float64)
+    return affine, World(parse_origin(affine[:3, 3].tolist()), _SPACE, unit)

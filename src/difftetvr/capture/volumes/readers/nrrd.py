@@ -16,6 +16,7 @@ from difftetvr.capture.volumes.readers.nrrd_axes import axis_steps, spatial_axes
 from difftetvr.capture.volumes.stored import AT_END, Encoding, Stored, behind_lines, first_bytes, read_parts
 from difftetvr.capture.volumes.volume_file import (
     RawVolume,
+    World,
     byte_count,
     parse_shape,
     parse_steps,
@@ -67,7 +68,8 @@ def read_nrrd(path: Path) -> RawVolume:
         values = text_to_volume(text, shape, dtype, path)
     else:
         values = to_volume(read_parts(parts, byte_count(shape, dtype), path), shape, dtype, path)
-    return RawVolume(values, spacing or (1.0, 1.0, 1.0), directions, told.notes if told else ())
+    notes, world = (told.notes, told.world) if told else ((), World())
+    return RawVolume(values, spacing or (1.0, 1.0, 1.0), directions, notes, world)
 
 
 def _read_header(path: Path) -> tuple[dict[str, str], list[str], int]:

@@ -8,11 +8,21 @@ from pathlib import Path
 from typing import NamedTuple
 
 from difftetvr.capture.volumes.units import filled, in_one_unit
-from difftetvr.capture.volumes.volume_file import parse_numbers
+from difftetvr.capture.volumes.volume_file import World, parse_numbers, parse_origin
 from difftetvr.errors import CaptureError
 
 _OF_SPACE = ("domain", "space", "none", "???", "")
 _LEFT_HANDED = ("left-anterior-superior", "las", "3d-left-handed")
+_RAS, _LPS = "right-anterior-superior", "left-posterior-superior"
+# What spaces are once those that are left-handed have their first axis reversed.
+_SPACES = {
+    **{name: name for name in (_RAS, _LPS, "scanner-xyz", "3d-right-handed")},
+    "ras": _RAS,
+    "lps": _LPS,
+    "left-anterior-superior": _RAS,
+    "las": _RAS,
+    "3d-left-handed": "3d-right-handed",
+}
 
 
 def spatial_axes(path: Path, fields: dict[str, str]) -> list[int]:
@@ -53,10 +63,12 @@ class AxisSteps(NamedTuple):
     Attributes:
         steps: From a sample to the next along each of the axes, in a right-handed world.
         notes: What was converted or assumed, a sentence each.
+        world: Where they begin.
     """
 
     steps: list[list[float]]
     notes: tuple[str, ...]
+    world: World
 
 
 def axis_steps(path: Path, fields: dict[str, str], axes: list[int]) -> AxisSteps | None:
@@ -65,22 +77,26 @@ def axis_steps(path: Path, fields: dict[str, str], axes: list[int]) -> AxisSteps
     Raises:
         CaptureError: What it says is incomplete.
     """
-    notes: tuple[str, ...] = ()
+    space = fields.get("space", "").lower()
     if vectors := _vectors(fields):
         steps = [_vector(word) for word in _chosen(path, vectors, axes)]
-        scales, notes = in_one_unit((1.0, 1.0, 1.0), _units(fields, "spaceunits", [0, 1, 2]), path)
+        scales, notes, unit = in_one_unit((1.0, 1.0, 1.0), _units(fields, "spaceunits", [0, 1, 2]), path)
         steps = [[scale * part for scale, part in zip(scales, step)] if len(step) == 3 else step for step in steps]
+        x, y, z = parse_origin([scale * x for scale, x in zip(scales, _vector(fields.get("spaceorigin", "")))])
     elif "spacings" in fields:
         words = _chosen(path, fields["spacings"].split(), axes)
-        steps, notes = _along_axes(path, fields, axes, parse_numbers(words), words)
+        steps, notes, unit = _along_axes(path, fields, axes, parse_numbers(words), words)
+        x, y, z = _first_of_axes(fields, axes, steps)
     elif "axismins" in fields and "axismaxs" in fields:
         words = [fields["axismins"], "to", fields["axismaxs"]]
-        steps, notes = _along_axes(path, fields, axes, _distances(fields, axes), words)
+        steps, notes, unit = _along_axes(path, fields, axes, _distances(fields, axes), words)
+        x, y, z = _first_of_axes(fields, axes, steps)
     else:
         return None
-    if fields.get("space", "").lower() in _LEFT_HANDED:
+    if space in _LEFT_HANDED:
         steps = [[-step[0], *step[1:]] for step in steps if step]
-    return AxisSteps(steps, notes)
+        x = -x
+    return AxisSteps(steps, notes, World((x, y, z), _SPACES.get(space, ""), unit))
 
 
 def _chosen(path: Path, words: list[str], axes: list[int]) -> list[str]:
@@ -105,8 +121,11 @@ def _vector(text: str) -> list[float]:
 
 def _along_axes(
     path: Path, fields: dict[str, str], axes: list[int], distances: list[float], words: list[str]
-) -> AxisSteps:
-    """Steps of so many units along x, y and z; by the format's definition, NaN is a distance that nobody knows."""
+) -> tuple[list[list[float]], tuple[str, ...], str]:
+    """Steps of so many units along x, y and z, notes, and the unit.
+
+    By the format's definition, NaN is a distance that nobody knows.
+    """
     if len(distances) != 3:
         given = " ".join(words)[:60]
         raise CaptureError(f"'{path}' gives the sample distances '{given}'; it needs a number for each axis.")
@@ -117,18 +136,31 @@ def _along_axes(
     units = [told[0] if told and math.isnan(distance) else unit for unit, distance in zip(units, distances)]
     converted = in_one_unit(known.values, units, path)
     steps = [[d if axis == other else 0.0 for other in range(3)] for axis, d in enumerate(converted.values)]
-    return AxisSteps(steps, (*known.notes, *converted.notes))
+    return steps, (*known.notes, *converted.notes), converted.unit
+
+
+def _first_of_axes(fields: dict[str, str], axes: list[int], steps: list[list[float]]) -> tuple[float, float, float]:
+    """The first sample's place by the least ends of the axes; see `_distances`."""
+    lower = parse_numbers(fields.get("axismins", "").split())
+    if len(lower) <= max(axes):
+        return parse_origin([])
+    halves = [0.0 if _is_node(fields, axis) else 0.5 * steps[place][place] for place, axis in enumerate(axes)]
+    return parse_origin([lower[axis] + half for axis, half in zip(axes, halves)])
 
 
 def _distances(fields: dict[str, str], axes: list[int]) -> list[float]:
     """Of samples, by the ends of the axes: those of the outermost cells, or where the header says so, nodes."""
     lower, upper = (parse_numbers(fields[key].split()) for key in ("axismins", "axismaxs"))
-    centers = (fields.get("centers") or fields.get("centerings") or "").lower().split()
     distances = []
     for axis in axes:
         if max(axis + 1, 2) > min(len(lower), len(upper)):
             return []
-        is_node = axis < len(centers) and centers[axis] == "node"
-        intervals = int(fields["sizes"].split()[axis]) - int(is_node)
+        intervals = int(fields["sizes"].split()[axis]) - int(_is_node(fields, axis))
         distances.append((upper[axis] - lower[axis]) / max(intervals, 1))
     return distances
+
+
+def _is_node(fields: dict[str, str], axis: int) -> bool:
+    """Whether the first and the last sample lie at the ends of an axis, not in the middle of its outermost cells."""
+    centers = (fields.get("centers") or fields.get("centerings") or "").lower().split()
+    return axis < len(centers) and centers[axis] == "node"

@@ -94,9 +94,9 @@ def _ome_distances(path: Path, pixels: ElementTree.Element) -> Distances:
     # What is not given has no unit, either.
     assumed = next(unit for unit, size in zip(units, known) if size is not None)
     units = [assumed if size is None else unit for unit, size in zip(units, known)]
-    values, notes = filled(known, path)
-    distances = in_one_unit(values, units, path, _UNIT_OF_OME)
-    return Distances(distances.values, (*notes, *distances.notes))
+    given = filled(known, path)
+    distances = in_one_unit(given.values, units, path, _UNIT_OF_OME)
+    return Distances(distances.values, (*given.notes, *distances.notes))
 
 
 def _ome_pixels(description: str) -> ElementTree.Element | None:

@@ -5,7 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
-from difftetvr.capture.volumes.volume_file import RawVolume, parse_numbers, parse_shape, parse_steps
+from difftetvr.capture.volumes.volume_file import (
+    RawVolume,
+    World,
+    parse_numbers,
+    parse_origin,
+    parse_shape,
+    parse_steps,
+)
 from difftetvr.errors import CaptureError
 from difftetvr.vtk_xml import Document, is_numeric
 
@@ -32,12 +39,14 @@ def read_vti(path: Path) -> RawVolume:
     if len(limits) != 6:
         raise CaptureError(f"'{path}' has no valid Extent; get the file anew.")
     shape = parse_shape([limits[2 * axis + 1] - limits[2 * axis] + 1 for axis in range(3)], path)
-    spacing, directions = parse_steps(_steps(image), path)
+    steps = _steps(image)
+    spacing, directions = parse_steps(steps, path)
     array, note = _point_array(path, pieces[0])
     if not is_numeric(array):
         raise CaptureError(f"'{path}' has values of type '{array.get('type')}'; give integers or floats.")
     values = document.array(array, shape[0] * shape[1] * shape[2])
-    return RawVolume(values.reshape(shape[::-1]), spacing, directions, note)
+    world = World(_first_place(image, steps, limits[::2]))
+    return RawVolume(values.reshape(shape[::-1]), spacing, directions, note, world)
 
 
 def _steps(image: Element) -> list[list[float]]:
@@ -48,6 +57,12 @@ def _steps(image: Element) -> list[list[float]]:
     if len(spacing) != 3 or len(matrix) != 9:
         return []
     return [[spacing[axis] * matrix[axis + 3 * row] for row in range(3)] for axis in range(3)]
+
+
+def _first_place(image: Element, steps: list[list[float]], first: list[int]) -> tuple[float, float, float]:
+    """Where the sample of the first indices lies; the origin is that of the indices 0."""
+    origin = parse_origin(parse_numbers((image.get("Origin") or "").split()))
+    return parse_origin([x + sum(n * step[k] for n, step in zip(first, steps)) for k, x in enumerate(origin)])
 
 
 def _point_array(path: Path, piece: Element) -> tuple[Element, tuple[str, ...]]:
