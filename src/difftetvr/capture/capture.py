@@ -268,7 +268,7 @@ class Capture:
 
         None where nothing tells the object from its background.
         """
-        return silhouettes(self.images, self.alphas, self.train_indices.tolist())
+        return silhouettes(self.images, self.alphas, self.train_indices.tolist(), self.valid)
 
     @property
     def is_cut_out(self) -> bool:
