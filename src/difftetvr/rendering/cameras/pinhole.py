@@ -173,12 +173,15 @@ class Camera:
     def project(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Where points are seen; differentiable in them and in all parameters.
 
+        Beside the image, where the formulas of a lens may fold, what it does at the image's rim goes on in proportion;
+        derivatives there leave out that the rim moves.
+
         Args:
             points: (N, 3) in world space.
 
         Returns:
             (N, 2) pixels, which may lie outside of the image; and (N,) how many pixels a step of length 1 across the
-            line of sight covers there. Points are seen where that is greater than 0: it is not behind the camera.
+            line of sight covers there. Where that is not greater than 0, points are behind the camera and not seen.
         """
         flat, enlarged = self._flattened(self.to_camera_space(points))
         fx, fy, cx, cy = self._pinhole(flat.dtype, flat.device)
