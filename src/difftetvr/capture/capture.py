@@ -37,7 +37,7 @@ class Capture:
     encoded twice nor compared across spaces.
 
     Attributes:
-        cameras: N cameras, each of its image's size.
+        cameras: N cameras, each of its image's size: pinholes, or `LensCamera` where a lens distorts.
         images: (N, H, W, 3) float32 RGB, premultiplied over black, on the CPU. Photographs are kept as bytes, and
             unpacked to the same view by view when they are taken by index: ``images[view]``. Images of several sizes
             are :class:`~difftetvr.capture.MixedImages`, of which there is no more than that.

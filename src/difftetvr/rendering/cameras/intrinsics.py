@@ -9,6 +9,7 @@ import torch
 
 from difftetvr.rendering.cameras.distortion import Distortion
 
+_AT_ONCE = 1 << 18  # pixels
 _EDGE = 65  # places along each side of an image by which its field of view is measured
 
 
@@ -76,7 +77,9 @@ class FieldOfView:
 def field_of_view(lens: Intrinsics) -> FieldOfView:
     """Where the rays of all pixels of a lens go."""
     distorted = lens.to_normalised(lens.pixel_centers())
-    directions = lens.distortion.directions(lens.distortion.undistort(distorted))
+    # Some rows at a time: what is needed in between takes many times the memory of the result.
+    rows = distorted.split(max(1, _AT_ONCE // lens.width))
+    directions = torch.cat([lens.distortion.directions(lens.distortion.undistort(part)) for part in rows])
     known = torch.isfinite(directions).all(-1)
     ahead = directions.new_tensor([0.0, 0.0, 1.0])
     return FieldOfView(torch.where(known[..., None], directions, ahead), known)
