@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from capture.photos.photo_scene import write_colmap, write_nerf_synthetic
+from capture.photos.photo_scene import dump, write_colmap, write_nerf_synthetic, write_transforms
 from commands.helpers import FEW_ROUNDS, fails
 from PIL import Image
 
@@ -116,3 +116,40 @@ def test_a_scene_with_a_background_is_fitted_with_its_surroundings(tmp_path, sta
     mesh, field = load(tmp_path / "out" / "model.vtu")
     lower, upper = mesh.bounds().numpy()
     assert (upper - lower > 8 * 1.4).all() and field.harmonics is not None
+
+
+def test_lenses_that_are_kept(tmp_path, capsys):
+    """By all commands that read photographs; the run and its config.json keep the option."""
+    write_transforms(tmp_path / "ball", k1=-0.2, k2=0.05)
+    out, again = tmp_path / "out", tmp_path / "again"
+    assert cli.main(["fit", str(tmp_path / "ball"), "-o", str(out), "--keep-lens", *FIT]) == 0
+    saved = json.loads((out / "config.json").read_text())
+    assert saved["capture_options"] == {"downscale": 1, "keep_lens": True}
+    metrics = json.loads((out / "metrics.json").read_text())
+    model, ball = str(out / "model.vtu"), str(tmp_path / "ball")
+    assert cli.main(["eval", model, ball, "--keep-lens", "-o", str(tmp_path / "kept.json")]) == 0
+    assert cli.main(["eval", model, ball, "-o", str(tmp_path / "resampled.json")]) == 0
+    kept, resampled = (json.loads((tmp_path / f"{name}.json").read_text())["psnr"] for name in ("kept", "resampled"))
+    assert kept == pytest.approx(metrics["psnr"], abs=1e-4) and kept != pytest.approx(resampled, abs=1e-4)
+    assert cli.main(["compare", ball, model, "-o", str(tmp_path / "sheet.png"), "--keep-lens", "--no-cut"]) == 0
+    capsys.readouterr()
+    assert cli.main(["info", ball, "--keep-lens"]) == 0
+    assert "opencv (16 views)" in capsys.readouterr().out
+    assert cli.main(["info", ball]) == 0 and "opencv" not in capsys.readouterr().out
+    # Options of a run may be turned off again, which is another run then.
+    assert cli.main(["fit", ball, "-o", str(out), "--resume"]) == 0
+    assert "has other views" in fails(capsys, "fit", ball, "-o", out, "--resume", "--no-keep-lens")
+    assert cli.main(["fit", "--config", str(out / "config.json"), "-o", str(again)]) == 0
+    assert (again / "model.vtu").read_bytes() == (out / "model.vtu").read_bytes()
+
+
+def test_fisheyes_need_their_lens(tmp_path, capsys):
+    write_transforms(tmp_path / "ball", camera_model="OPENCV_FISHEYE", k1=0.01)
+    fit = ("fit", tmp_path / "ball", "-o", tmp_path / "out", *FIT)
+    assert "is a fisheye, which no pinhole can stand for; keep it" in fails(capsys, *fit)
+    assert not (tmp_path / "out").exists()
+    assert cli.main([str(word) for word in (*fit, "--keep-lens")]) == 0
+    dump(tmp_path / "config.json", {"capture_options": {"keep_lens": "yes"}})
+    wrong = fails(capsys, *fit, "--config", tmp_path / "config.json", "--overwrite")
+    assert "capture_options.keep_lens is 'yes'" in wrong
+    assert "has no setting 'keep_lens'" in fails(capsys, "fit", "tooth", "-o", tmp_path / "tooth", "--keep-lens")

@@ -273,7 +273,9 @@ def _saved(folder: Path) -> list[Seed]:
     own.mkdir()
     photo_scene.write_tiny(own / "tiny.npz")
     dtv.load_capture(folder / "transforms").save(own / "saved.npz")
-    return [Seed("capture", own, name, (name,), 2 * _PHOTOS) for name in ("tiny.npz", "saved.npz")]
+    photo_scene.write_transforms(folder / "distorted", k1=-0.2, k2=0.05)
+    dtv.load_capture(folder / "distorted", keep_lens=True).save(own / "lenses.npz")
+    return [Seed("capture", own, name, (name,), 2 * _PHOTOS) for name in ("tiny.npz", "saved.npz", "lenses.npz")]
 
 
 def _others(folder: Path) -> list[Seed]:

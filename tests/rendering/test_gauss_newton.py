@@ -9,7 +9,7 @@ from scipy.optimize import minimize
 import difftetvr as dtv
 from difftetvr.errors import DiffTetError, MeshError
 from difftetvr.mesh import Field, TetMesh, bisect_edges
-from difftetvr.rendering import Camera, render
+from difftetvr.rendering import Camera, LensCamera, render
 from difftetvr.rendering.gauss_newton import HatDerivatives, model_image
 
 BACKGROUND = (0.3, 0.6, 0.1)
@@ -84,6 +84,30 @@ def test_gradients_of_vertices_are_those_of_autograd(where, density, tolerance):
     assert model.error == pytest.approx(float((image.detach() - truth).square().mean()), rel=1e-12)
     assert (model.vertices.gradient[:, :3] - color).norm() <= tolerance * color.norm()
     assert (model.vertices.gradient[:, 3] - absorption).norm() <= tolerance * absorption.norm()
+
+
+@pytest.mark.parametrize("where", [OUTSIDE, INSIDE])
+def test_models_of_a_lens(where):
+    """Without distortion they are those of the pinhole, also from inside; with it their gradient is autograd's."""
+    mesh, field, truth = random_scene()
+    pinhole = camera_at(where)
+    numbers = (pinhole.world_to_camera, pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy, pinhole.width, pinhole.height)
+    options = {"background": BACKGROUND, "transmittance_threshold": 0.0}
+    expected = model_image(mesh, field, pinhole, truth, **options)
+    flat = model_image(mesh, field, LensCamera(*numbers), truth, **options)
+    assert flat.error == pytest.approx(expected.error, rel=1e-6)
+    for name in ("vertices", "edges", "faces"):
+        one, other = (getattr(model, name).gradient for model in (flat, expected))
+        assert (one - other).norm() <= 1e-4 * other.norm()
+    lens = LensCamera(*numbers, coefficients=[-0.6, 0.3])
+    leaves = [field.color.requires_grad_(), field.density.requires_grad_()]
+    color, absorption = torch.autograd.grad(
+        (render(mesh, field, lens, BACKGROUND).color - truth).square().mean(), leaves
+    )
+    bent = model_image(mesh, field, lens, truth, **options)
+    assert (bent.vertices.gradient[:, :3] - color).norm() <= 0.03 * color.norm()
+    assert (bent.vertices.gradient[:, 3] - absorption).norm() <= 0.03 * absorption.norm()
+    assert (expected.vertices.gradient[:, :3] - color).norm() > 0.06 * color.norm()
 
 
 @pytest.mark.parametrize("where", [OUTSIDE, INSIDE])

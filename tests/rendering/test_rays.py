@@ -107,6 +107,41 @@ def test_colours_that_depend_on_the_direction() -> None:
         render(mesh, seen, Rays(*random_rays(8)))
 
 
+def test_rays_know_whether_they_start_at_one_point() -> None:
+    """Of all sources with one, without a look at values, which would have to come from the device."""
+    pose = OUTSIDE.world_to_camera
+    lens = dtv.LensCamera(pose, 20.0, 20.0, 11.5, 9.5, 23, 19, coefficients=[-0.2, 0.05])
+    source = dtv.Detector(torch.zeros(3), [0.1, 0.0, 0.0], [0.0, 0.1, 0.0], 7, 6, source=OUTSIDE.position)
+    learnt = Camera(pose, *(torch.tensor(v, requires_grad=True) for v in (20.0, 20.0, 11.5, 9.5)), 23, 19)
+    for camera in (OUTSIDE, lens, learnt, dtv.PanoramicCamera(pose, 8, 4), source):
+        rays = camera.rays()
+        for same in (rays, rays.to(dtype=torch.float64), rays.relative_to((0.0, 0.0, 0.0))):
+            torch.testing.assert_close(same.eye, OUTSIDE.position)
+        torch.testing.assert_close(rays.relative_to((1.0, 2.0, 3.0)).eye, OUTSIDE.position - torch.arange(1.0, 4.0))
+    parallel = dtv.ParallelCamera(pose, 0.1, 7, 6)
+    assert parallel.rays().eye is None and Rays(torch.zeros(0, 3), [0.0, 0.0, 1.0]).eye is None
+    # Equal ones that are several, too, are found to be equal where that is needed.
+    assert Rays(torch.ones(4, 3), torch.rand(4, 3) + 0.1).eye is None
+
+
+def test_a_lens_sees_colours_that_depend_on_the_direction() -> None:
+    mesh, field = scene()
+    harmonics = torch.randn(mesh.num_vertices, 8, 3, dtype=torch.float64)
+    seen = Field(field.color, field.density, harmonics=harmonics)
+    pose = INSIDE.world_to_camera.clone().requires_grad_()
+    lens = dtv.LensCamera(pose, 15.0, 15.0, 11.5, 9.5, 23, 19, coefficients=[-0.2, 0.05])
+    expected = render(mesh, seen.seen_from(mesh, INSIDE.position), lens)
+    assert torch.allclose(render(mesh, seen, lens).color, expected.color, rtol=0.0, atol=1e-9)
+    shift = torch.tensor([4.2e5, 5.4e6, 300.0], dtype=torch.float64)
+    far = TetMesh(mesh.vertices + shift, mesh.tets).to(dtype=torch.float32)
+    moved = pose.detach().clone()
+    moved[:3, 3] -= moved[:3, :3] @ shift
+    image = render(far, seen.to(dtype=torch.float32), lens.with_pose(moved))
+    assert float((image.color - expected.color.detach()).abs().max()) < 5e-5
+    (gradient,) = torch.autograd.grad(render(mesh, seen, lens).color.sum(), pose)
+    assert float(gradient[:3].abs().max()) > 0.0
+
+
 @pytest.mark.parametrize("offset", [(0.0, 0.0, 0.0), (4.2e5, 5.4e6, 300.0)])
 @pytest.mark.parametrize("away", [0.0, 1e3, 1e6])
 def test_far_origins_lose_nothing_in_float32(offset: tuple[float, ...], away: float) -> None:

@@ -36,7 +36,7 @@ class Capture:
     encoded twice nor compared across spaces.
 
     Attributes:
-        cameras: N cameras, each of its image's size.
+        cameras: N cameras, each of its image's size: pinholes, or `LensCamera` where a lens distorts.
         images: (N, H, W, 3) float32 RGB, premultiplied over black, on the CPU. Photographs are kept as bytes, and
             unpacked to the same view by view when they are taken by index: ``images[view]``. Images of several sizes
             are :class:`~difftetvr.capture.MixedImages`, of which there is no more than that.
@@ -267,7 +267,7 @@ class Capture:
 
         None where nothing tells the object from its background.
         """
-        return silhouettes(self.images, self.alphas, self.train_indices.tolist())
+        return silhouettes(self.images, self.alphas, self.train_indices.tolist(), self.valid)
 
     @property
     def is_cut_out(self) -> bool:

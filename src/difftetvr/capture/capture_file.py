@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,15 +13,17 @@ from difftetvr.archive import read_arrays
 from difftetvr.capture.packed import Images, MixedImages, PackedImages, shapes_of
 from difftetvr.errors import CameraError, CaptureError
 from difftetvr.files import atomic_write
+from difftetvr.rendering.cameras.lens import LensCamera
 from difftetvr.rendering.cameras.pinhole import Camera
 
 # Version 1 knew no encoding (all was linear), no bytes, no points and no masks, version 2 no surroundings, version 3
-# no images of several sizes; where they are of one size, version 3 is still what is written.
-_VERSION, _VERSION_OF_ONE_SIZE = 4, 3
+# no images of several sizes, version 4 no lenses. The first version that knows all of a capture is what is written.
+_VERSION, _VERSION_OF_PINHOLES, _VERSION_OF_ONE_SIZE = 5, 4, 3
 _NEEDED = ("version", "images", "test", "bounds", "name", "density_unit", "world_to_camera", "intrinsics")
 _OPTIONAL = ("alphas", "valid", "points", "point_colors")
 _PER_PIXEL = ("images", "alphas", "valid")
-_KNOWN = (*_NEEDED, *_OPTIONAL, "encoding", "surroundings", "sizes")
+_LENS = ("lens_models", "lens_coefficients")
+_KNOWN = (*_NEEDED, *_OPTIONAL, *_LENS, "encoding", "surroundings", "sizes")
 
 
 def write_capture(path: str | Path, fields: Mapping[str, Any]) -> None:
@@ -37,9 +39,10 @@ def write_capture(path: str | Path, fields: Mapping[str, Any]) -> None:
     if Path(path).suffix.lower() != ".npz":
         raise CaptureError(f"A capture is saved as .npz; '{path}' ends otherwise.")
     cameras, images = fields["cameras"], fields["images"]
-    is_mixed = isinstance(images, MixedImages)
+    is_mixed, lenses = isinstance(images, MixedImages), _lens_arrays(cameras)
+    without_lenses = _VERSION_OF_PINHOLES if is_mixed else _VERSION_OF_ONE_SIZE
     content: dict[str, Any] = {
-        "version": np.array(_VERSION if is_mixed else _VERSION_OF_ONE_SIZE),
+        "version": np.array(_VERSION if lenses else without_lenses),
         "images": _array(images),
         "test": fields["test"].numpy(),
         "bounds": fields["bounds"].numpy(),
@@ -49,6 +52,7 @@ def write_capture(path: str | Path, fields: Mapping[str, Any]) -> None:
         "intrinsics": np.array([(c.fx, c.fy, c.cx, c.cy) for c in cameras]),
         "encoding": np.array(fields["encoding"]),
         "surroundings": np.array(fields["surroundings"]),
+        **lenses,
     }
     if is_mixed:
         content["sizes"] = np.array([shape[:2] for shape in shapes_of(images)])
@@ -77,12 +81,8 @@ def read_capture(path: str | Path) -> dict[str, Any]:
         tensors |= {key: torch.from_numpy(content[key]) for key in _OPTIONAL if key in content}
         poses = tensors.pop("world_to_camera")
         sizes = _sizes(content, len(poses))
-        cameras = [
-            Camera(pose, float(fx), float(fy), float(cx), float(cy), width, height)
-            for pose, (fx, fy, cx, cy), (height, width) in zip(poses, content["intrinsics"], sizes, strict=True)
-        ]
         return {
-            "cameras": cameras,
+            "cameras": _cameras(poses, content, sizes),
             "alphas": None,
             "name": str(content["name"]),
             "density_unit": float(content["density_unit"]),
@@ -94,6 +94,51 @@ def read_capture(path: str | Path) -> dict[str, Any]:
         raise CaptureError(f"A camera in '{path}' is not valid: {error}") from None
     except (TypeError, ValueError, OverflowError):
         raise CaptureError(f"An array in '{path}' has the wrong shape or type; get the file anew.") from None
+
+
+def _lens_arrays(cameras: Sequence[Camera]) -> dict[str, np.ndarray]:
+    """Models of the cameras' lenses, "" for a pinhole's, and (N, K) coefficients, filled up with NaN; {} for pinholes.
+
+    Coefficients are finite, so what is none is known.
+    """
+    given = [camera.coefficients.tolist() if isinstance(camera, LensCamera) else [] for camera in cameras]
+    most = max(map(len, given))
+    if not most:
+        return {}
+    models = [camera.model if isinstance(camera, LensCamera) else "" for camera in cameras]
+    padded = [values + [np.nan] * (most - len(values)) for values in given]
+    return dict(zip(_LENS, (np.array(models), np.array(padded)), strict=True))
+
+
+def _cameras(poses: torch.Tensor, content: Mapping[str, np.ndarray], sizes: list[tuple[int, int]]) -> list[Camera]:
+    """The cameras of (N, 4, 4) poses, with the lenses that :func:`_lens_arrays` wrote.
+
+    Raises:
+        ValueError: There is not one of everything for each of them.
+    """
+    cameras: list[Camera] = []
+    lenses = _lenses(content, len(poses))
+    for pose, pinhole, size, (model, coefficients) in zip(poses, content["intrinsics"], sizes, lenses, strict=True):
+        fx, fy, cx, cy = map(float, pinhole)
+        numbers = (pose, fx, fy, cx, cy, size[1], size[0])
+        cameras.append(LensCamera(*numbers, model=model, coefficients=coefficients) if model else Camera(*numbers))
+    return cameras
+
+
+def _lenses(content: Mapping[str, np.ndarray], count: int) -> list[tuple[str, torch.Tensor]]:
+    """Model and coefficients of each camera's lens, "" and none for a pinhole.
+
+    Raises:
+        ValueError: What the file says of lenses does not fit together.
+    """
+    if not any(key in content for key in _LENS):
+        return [("", torch.empty(0))] * count
+    models, rows = (content.get(key, np.empty(0)) for key in _LENS)
+    known = ~np.isnan(rows)
+    counts = known.sum(axis=-1, keepdims=True)
+    if rows.ndim != 2 or models.shape != rows.shape[:1] or (known != (np.arange(rows.shape[1]) < counts)).any():
+        raise ValueError("the lenses do not fit together")
+    return [(str(model), torch.from_numpy(row[: int(n)])) for model, row, n in zip(models, rows, counts[:, 0])]
 
 
 def _array(values: Images) -> np.ndarray:

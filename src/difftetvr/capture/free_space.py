@@ -62,13 +62,7 @@ class FreeSpace:
             # Most places are far from most cameras.
             away = torch.linalg.vector_norm(places - camera.position.to(places), dim=1)
             near = true_indices((away < reach) & ~found)
-            local = camera.to_camera_space(places[near])
-            depth, margin = local[:, 2], _margin(camera)
-            # Pixels times depth, which are finite also beside the camera.
-            x, y = (camera.fx * local[:, 0] + camera.cx * depth, camera.fy * local[:, 1] + camera.cy * depth)
-            within = (x > -margin * depth) & (x < (camera.width + margin) * depth)
-            within &= (y > -margin * depth) & (y < (camera.height + margin) * depth)
-            found[near] = within & (depth > 0.0)
+            found[near] = in_image(*camera.project(places[near]), camera, _margin(camera))
         return found
 
 

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from difftetvr.capture.packed import Images
+from difftetvr.capture.packed import Images, Masks
 from difftetvr.capture.viewing import in_image, project
 from difftetvr.rendering.cameras.pinhole import Camera
 
@@ -23,34 +23,49 @@ _BLACK_BORDER = 0.95
 _LEAST_TRANSPARENT = 0.1
 
 
-def silhouettes(images: Images, alphas: Images | None, views: Sequence[int]) -> list[torch.Tensor] | None:
+def silhouettes(
+    images: Images, alphas: Images | None, views: Sequence[int], valid: Masks | None = None
+) -> list[torch.Tensor] | None:
     """Where the object may be seen: where alpha is not 0, or where black surrounds what is not black.
 
     Args:
         images: (N, H, W, 3) images over black, or of several sizes.
         alphas: (N, H, W) likewise, or None where they are unknown.
         views: The views to look at.
+        valid: (N, H, W) bool likewise, the pixels that say anything; None for all. Others may show the object.
 
     Returns:
         (H, W) bool masks of the views, or None where nothing tells the object from its background: few pixels are
         transparent, or it is not black around the object.
     """
     if alphas is not None:
-        masks = [alphas[view] > _LEAST_ALPHA for view in views]
+        masks = [_or_invalid(alphas[view] > _LEAST_ALPHA, view, valid) for view in views]
         transparent = sum(int((~mask).sum()) for mask in masks)
         return masks if transparent >= _LEAST_TRANSPARENT * sum(mask.numel() for mask in masks) else None
-    found, border = [], []
+    found: list[torch.Tensor] = []
+    border: list[float] = []
     for view in views:
         mask = (images[view] > _LEAST_RADIANCE).any(dim=-1)
         found.append(mask)
-        border.append(float((~torch.cat([mask[0], mask[-1], mask[:, 0], mask[:, -1]])).float().mean()))
+        known = _border(mask) if valid is None else _border(mask)[_border(valid[view])]
+        border += [float((~known).float().mean())] if len(known) else []
         # Most captures are ruled out by their first views, which saves unpacking the others.
-        if np.mean(border) < _BLACK_BORDER / 2:
+        if border and np.mean(border) < _BLACK_BORDER / 2:
             return None
-    if np.mean(border) < _BLACK_BORDER:
+    if not border or np.mean(border) < _BLACK_BORDER:
         return None
     # What is black inside the object belongs to it.
-    return [torch.from_numpy(ndimage.binary_fill_holes(mask.numpy())) for mask in found]
+    filled = (torch.from_numpy(ndimage.binary_fill_holes(mask.numpy())) for mask in found)
+    return [_or_invalid(mask, view, valid) for mask, view in zip(filled, views, strict=True)]
+
+
+def _border(mask: torch.Tensor) -> torch.Tensor:
+    """(N,) the pixels along the edges."""
+    return torch.cat([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
+
+
+def _or_invalid(mask: torch.Tensor, view: int, valid: Masks | None) -> torch.Tensor:
+    return mask if valid is None else mask | ~valid[view]
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,12 +116,11 @@ class VisualHull:
         seen = np.zeros(len(centers), dtype=np.int32)
         radius = 0.5 * math.sqrt(3.0) * cell
         for camera, silhouette in zip(self.cameras, self.shapes, strict=True):
-            pixels, depth = project(centers[alive], camera)
-            with np.errstate(divide="ignore"):
-                reach = radius * max(camera.fx, camera.fy) / depth
-            centered = in_image(pixels, depth, camera)
+            pixels, enlarged = project(centers[alive], camera)
+            reach = radius * enlarged
+            centered = in_image(pixels, enlarged, camera)
             # Only cells that will be split need the benefit of the doubt.
-            seen[alive] += centered if silhouette is None else in_image(pixels, depth, camera, reach)
+            seen[alive] += centered if silhouette is None else in_image(pixels, enlarged, camera, reach)
             if silhouette is not None:
                 alive = alive[~centered | silhouette.touches(pixels, reach)]
         kept = np.zeros(len(centers), dtype=bool)

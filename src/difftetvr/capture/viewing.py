@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from difftetvr.rendering.cameras.pinhole import Camera
@@ -24,19 +26,23 @@ def positions_of(cameras: Sequence[Camera]) -> Floats:
 
 
 def project(points: Floats, camera: Camera) -> tuple[Floats, Floats]:
-    """(C, 2) pixels and (C,) depths of points in world space."""
-    pose = pose_of(camera)
-    local = points @ pose[:3, :3].T + pose[:3, 3]
-    depth = local[:, 2]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return local[:, :2] / depth[:, None] * (camera.fx, camera.fy) + (camera.cx, camera.cy), depth
+    """(C, 2) pixels of points in world space, and (C,) pixels in a unit of length there; see `Camera.project`."""
+    pixels, enlarged = camera.project(torch.from_numpy(points))
+    return pixels.detach().numpy(), enlarged.detach().numpy()
 
 
-def in_image(pixels: Floats, depth: Floats, camera: Camera, reach: Floats | float = 0.0) -> NDArray[np.bool_]:
-    """(C,) bool, whether pixels lie in the image, or so near to it, in front of the camera."""
-    x, y = pixels.T
+def in_image(pixels: Any, enlarged: Any, camera: Camera, reach: Any = 0.0) -> Any:
+    """(C,) bool, whether pixels lie in the image, or so near to it, and not behind the camera.
+
+    Args:
+        pixels: (C, 2), an array or a tensor.
+        enlarged: (C,) pixels in a unit of length.
+        camera: The camera.
+        reach: How many pixels beside the image still count, one for all or (C,).
+    """
+    x, y = pixels[:, 0], pixels[:, 1]
     across = (x >= -reach) & (x < camera.width + reach)
-    return (depth > 0) & across & (y >= -reach) & (y < camera.height + reach)
+    return (enlarged > 0) & across & (y >= -reach) & (y < camera.height + reach)
 
 
 def cell_centers(box: Floats, count: int) -> Floats:

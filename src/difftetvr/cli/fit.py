@@ -107,8 +107,7 @@ class Fit:
 
     def to_json(self) -> dict[str, Any]:
         """The options that make the run what it is."""
-        views_of = {name: value for name, value in dataclasses.asdict(self.views_of).items() if value is not None}
-        return {"capture": self.capture, "capture_options": views_of, "fit": self.config.to_json()}
+        return {"capture": self.capture, "capture_options": self.views_of.given(), "fit": self.config.to_json()}
 
     @staticmethod
     def defaults(args: Sequence[str]) -> Fit | None:

@@ -9,7 +9,7 @@ import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import arg
 
@@ -39,7 +39,7 @@ TRUST_GROUPS: Groups = {"How far files are trusted": ("allow-outside", "allow-la
 """Where `TrustOptions` stand in the help of a command."""
 
 CAPTURE_GROUPS: Groups = {
-    "How photographs are read": ("downscale", "format", "bounds", "test-every"),
+    "How photographs are read": ("downscale", "format", "bounds", "test-every", "keep-lens"),
     "How a volume is read and seen": (
         *("transfer-function", "shape", "dtype", "spacing", "value-range", "attenuation"),
         *("views", "width", "height", "radius", "orbit"),
@@ -73,6 +73,8 @@ class CaptureOptions:
     pixels, on CUDA 1600; for info 1."""
     bounds: tuple[float, float, float, float, float, float] | None = None
     """Box to reconstruct from photos, its lower and its upper corner; default: found."""
+    keep_lens: bool = False
+    """Leave photos as their lens has distorted them, and render through it; default: resample them to a pinhole's."""
 
     transfer_function: str | None = None
     """Transfer function of a volume, .json or .xml."""
@@ -123,12 +125,17 @@ class CaptureOptions:
             console.print(f"Chosen for this machine: --downscale {downscale}", highlight=False)
         return dataclasses.replace(self, downscale=downscale)
 
+    def given(self) -> dict[str, Any]:
+        """Those that are not left as they are by default, by name."""
+        values = ((item, getattr(self, item.name)) for item in dataclasses.fields(self))
+        return {item.name: value for item, value in values if value != item.default}
+
     def load(self, name: str, console: Console) -> Capture:
         """Reads or renders the capture of that name."""
         from difftetvr.capture import load_capture
 
         with _saying(console), waiting(console, f"Preparing the views of {name}"):
-            return load_capture(name, **dataclasses.asdict(self))
+            return load_capture(name, **self.given())
 
     def summarise(self, name: str, console: Console) -> VolumeSummary:
         """Reads the volume of that name without rendering it."""

@@ -11,11 +11,11 @@ from difftetvr.errors import DiffTetError, MeshError, shown
 from difftetvr.inputs import as_reals, require_type
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.rendering.api import as_background
-from difftetvr.rendering.cameras.pinhole import Camera
 from difftetvr.rendering.kernels.composition import Composition
 from difftetvr.rendering.kernels.forward import render_forward
 from difftetvr.rendering.kernels.hats import RECORD, HatImage, hat_records
 from difftetvr.rendering.preparation import ViewOptions, prepare_view
+from difftetvr.rendering.rays import Rays, RaySource
 
 _TINY = 1e-30
 
@@ -147,7 +147,7 @@ class ImageModel:
 def model_image(
     mesh: TetMesh,
     field: Field,
-    camera: Camera,
+    camera: RaySource | Rays,
     truth: torch.Tensor,
     background: torch.Tensor | tuple[float, float, float] | None = None,
     transmittance_threshold: float = 1e-4,
@@ -162,7 +162,7 @@ def model_image(
     Args:
         mesh: Mesh.
         field: Its colours and densities, on vertices.
-        camera: Camera of the view.
+        camera: Camera of the view, or rays that are an image, (H, W).
         truth: (H, W, 3) what the image should be, on the mesh's device.
         background: (3,) linear RGB behind the volume; black if None.
         transmittance_threshold: Rays stop once their transmittance is at or below this value.
@@ -174,7 +174,7 @@ def model_image(
 
     Raises:
         MeshError: The field does not fit the mesh, lives on cells, or holds invalid values.
-        DiffTetError: The truth has another size than the camera, or an argument is out of range.
+        DiffTetError: The truth has another size than the camera's image, or an argument is out of range.
         BackendError: No back end runs on the device of the mesh.
     """
     require_type(field, Field, "field", "pass a difftetvr.Field", DiffTetError)
@@ -183,10 +183,9 @@ def model_image(
     if view.task.content != "vertex":
         raise MeshError("The field lives on cells; hat functions need colours and densities on vertices.")
     truth = as_reals(truth, "The true image", DiffTetError)
-    if truth.shape != (camera.height, camera.width, 3):
-        raise DiffTetError(
-            f"The true image has shape {tuple(truth.shape)}; the camera takes ({camera.height}, {camera.width}, 3)."
-        )
+    if len(view.shape) != 2 or truth.shape != (*view.shape, 3):
+        wanted = f"takes {(*view.shape, 3)}" if len(view.shape) == 2 else f"sees {view.shape}, which is no image"
+        raise DiffTetError(f"The true image has shape {tuple(truth.shape)}; the camera {wanted}.")
     if valid is not None and not (
         isinstance(valid, torch.Tensor) and valid.dtype == torch.bool and valid.shape == truth.shape[:2]
     ):
@@ -194,10 +193,9 @@ def model_image(
     behind = as_background(background, mesh.vertices)
     backend = view.task.backend
     with backend.exclusive(one_thread=deterministic):
-        tracer = view.tracer(None)
-        rendered = render_forward(
-            tracer, Composition(None if behind is None else backend.floats(behind), None, view.unit)
-        )
+        tracer = view.tracer(view.limits(None))
+        how = Composition(None if behind is None else backend.floats(behind), None, view.unit)
+        rendered = render_forward(tracer, how)
         image = backend.tensor(rendered.image.color, *truth.shape)
         residual = image - truth.to(image)
         if valid is not None:

@@ -14,8 +14,8 @@ from difftetvr.backend import eager, require_own_threads
 from difftetvr.errors import DiffTetError
 from difftetvr.inputs import require_type
 from difftetvr.mesh import Field, TetMesh
-from difftetvr.rendering.cameras.pinhole import Camera
 from difftetvr.rendering.preparation import ViewOptions, prepare_view
+from difftetvr.rendering.rays import Rays, RaySource
 from difftetvr.rendering.traversal.crossing import Span, Step, Tracer, corner_of, read_vertex
 from difftetvr.rendering.traversal.rays import Lanes
 from difftetvr.rendering.traversal.walk import Corner, Face
@@ -38,7 +38,7 @@ class RayStatistics:
 @torch.no_grad()
 def inspect_rays(
     mesh: TetMesh,
-    camera: Camera,
+    camera: RaySource | Rays,
     renderer: str = "marching",
     clip_plane: Sequence[float] | torch.Tensor | None = None,
 ) -> RayStatistics:
@@ -46,7 +46,7 @@ def inspect_rays(
 
     Args:
         mesh: The mesh.
-        camera: The camera.
+        camera: A camera, or any bundle of rays.
         renderer: How crossings are found, see :func:`difftetvr.render`.
         clip_plane: Only cells that reach into this half-space on the ray count; see there, too.
 

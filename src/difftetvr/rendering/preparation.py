@@ -126,7 +126,10 @@ class PreparedRays:
         device = mesh.vertices.device
         dtype = torch.float64 if device.type in _KNOW_FLOAT64 else mesh.vertices.dtype
         rays = rays.relative_to(mesh.origin)
-        origins, directions = (part.reshape(-1, 3).to(device, dtype) for part in (rays.origins, rays.directions))
+        directions = rays.directions.reshape(-1, 3).to(device, dtype)
+        # One origin of all is one on the device, too.
+        eye = rays.eye
+        origins = (rays.origins.reshape(-1, 3) if eye is None else eye).to(device, dtype).expand_as(directions)
         near, far = (end.reshape(-1).to(device, dtype) for end in rays.ends)
         directions = torch.nn.functional.normalize(directions, dim=1, eps=0.0)
         low, high = torch.aminmax(mesh.vertices.detach().to(dtype), dim=0)
@@ -302,7 +305,10 @@ def _content(
 
 def _eye(rays: Rays, mesh: TetMesh) -> torch.Tensor:
     """(3,) the point that all rays start at, relative to the mesh's origin."""
-    origins = rays.relative_to(mesh.origin).origins.reshape(-1, 3)
+    rays = rays.relative_to(mesh.origin)
+    if (eye := rays.eye) is not None:
+        return eye
+    origins = rays.origins.reshape(-1, 3)
     if not bool((origins.detach() == origins[:1].detach()).all()):
         raise DiffTetError(
             "The field's colours depend on the direction (harmonics), and are known for rays that start at one point; "

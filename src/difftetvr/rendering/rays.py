@@ -101,13 +101,30 @@ class Rays:
         """Shape of the bundle, without the last dimension of its vectors."""
         return self.directions.shape[:-1]
 
+    @property
+    def eye(self) -> torch.Tensor | None:
+        """(3,) the one point that all rays start at, where the origins were given as one vector; else None.
+
+        No values are compared: rays with equal origins of their own may start at one point and not know it.
+        """
+        sizes, strides = self.origins.shape[:-1], self.origins.stride()[:-1]
+        if 0 in sizes or any(size > 1 and stride != 0 for size, stride in zip(sizes, strides, strict=True)):
+            return None
+        return self.origins[(0,) * len(sizes)]
+
+    @property
+    def _starts(self) -> torch.Tensor:
+        """Origins, or the one that stands for all of them."""
+        eye = self.eye
+        return self.origins if eye is None else eye
+
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Rays:
         """The same rays on another device or in another precision; autograd sees them as a function of these.
 
         Raises:
             CameraError: This machine has no such device.
         """
-        tensors = (self.origins, self.directions, *self.ends)
+        tensors = (self._starts, self.directions, *self.ends)
         return Rays(*(moved(tensor, device, dtype, CameraError) for tensor in tensors))
 
     def at(self, distances: torch.Tensor | float) -> torch.Tensor:
@@ -124,7 +141,7 @@ class Rays:
         if not any(origin):
             return self
         shift = torch.tensor(list(origin), dtype=torch.float64, device=self.origins.device)
-        return replace(self, origins=self.origins.double() - shift)
+        return replace(self, origins=self._starts.double() - shift)
 
     @staticmethod
     def stacked(bundles: Sequence[Rays]) -> Rays:

@@ -26,6 +26,7 @@ from difftetvr.mesh.io import Defects
 from difftetvr.mesh.making.delaunay_check import is_convex, is_delaunay
 from difftetvr.mesh.making.overlaps import overlapping_cells
 from difftetvr.mesh.tetmesh import TetMesh
+from difftetvr.rendering.cameras.lens import LensCamera
 
 _QUALITY_BINS = 10
 _BAR_WIDTH = 30
@@ -148,6 +149,9 @@ def capture_table(name: str, capture: Capture) -> Table:
     )
     sizes = Counter(capture.image_sizes).most_common()
     table.add_row("image size" if len(sizes) == 1 else "image sizes", _sizes(sizes))
+    lenses = Counter(camera.model for camera in capture.cameras if isinstance(camera, LensCamera)).most_common()
+    if lenses:
+        table.add_row("lenses", ", ".join(f"{model} ({counted(count, 'view')})" for model, count in lenses))
     table.add_row("alpha", "known" if capture.alphas is not None else "unknown")
     table.add_row("colours", "linear" if capture.encoding == "linear" else "sRGB-encoded, as stored")
     if capture.points is not None:

@@ -209,8 +209,8 @@ def test_captures_of_the_first_version_are_read(tmp_path: Path) -> None:
     again = Capture.load(tmp_path / "old.npz")
     assert (again.encoding, again.surroundings) == ("linear", 1.0) and again.points is None and again.valid is None
     assert isinstance(again.images, torch.Tensor) and torch.equal(again.images[3], capture.images[3])
-    np.savez(tmp_path / "new.npz", **{**content, "version": np.array(5)})
-    with pytest.raises(CaptureError, match="version 5; update"):
+    np.savez(tmp_path / "new.npz", **{**content, "version": np.array(6)})
+    with pytest.raises(CaptureError, match="version 6; update"):
         Capture.load(tmp_path / "new.npz")
     for version in (np.inf, np.nan, "three", [1, 2], 1j):
         np.savez(tmp_path / "new.npz", **{**content, "version": np.array(version)})

@@ -12,9 +12,9 @@ import torch
 
 from difftetvr.capture.capture import Capture
 from difftetvr.capture.hull import silhouettes
-from difftetvr.capture.packed import Images
 from difftetvr.capture.photos.bounds import hull_bounds, point_bounds, require_resolved, require_seen, surroundings_of
-from difftetvr.capture.photos.photo_load import fitting_downscale, load_photos, make_camera, present_views
+from difftetvr.capture.photos.lens import make_camera
+from difftetvr.capture.photos.photo_load import Photos, fitting_downscale, load_photos, present_views
 from difftetvr.capture.photos.photo_set import PhotoSet, read_json
 from difftetvr.capture.photos.readers.camera_list import CAMERAS_FORMAT, read_camera_list
 from difftetvr.capture.photos.readers.colmap import colmap_models, read_colmap
@@ -26,7 +26,6 @@ from difftetvr.capture.volumes.readers.table import is_volume_file
 from difftetvr.declared import require_declared
 from difftetvr.errors import CaptureError, shown
 from difftetvr.inputs import as_whole
-from difftetvr.rendering.cameras.pinhole import Camera
 
 Corner = tuple[float, float, float]
 PhotoFormat = Literal["nerf-synthetic", "transforms", "colmap", "cameras", "tiny-nerf", "polycam", "record3d"]
@@ -56,6 +55,8 @@ class PhotoCapture:
             for 8 where the format does not say itself which views are held out.
         bounds: Lower and upper corner of the box to reconstruct, (x, y, z, x, y, z) or one after the other; None finds
             it by the images' alpha, the sparse points or the cameras.
+        keep_lens: Whether photographs are left as their lens has distorted them, and seen by a
+            :class:`~difftetvr.LensCamera`, fisheyes among them; else they are resampled to what a pinhole sees.
     """
 
     path: str
@@ -63,6 +64,7 @@ class PhotoCapture:
     downscale: int = 1
     test_every: int | None = None
     bounds: tuple[float, float, float, float, float, float] | tuple[Corner, Corner] | None = None
+    keep_lens: bool = False
 
     def __post_init__(self) -> None:
         require_declared(self, CaptureError)
@@ -100,8 +102,8 @@ class PhotoCapture:
         photo_set.views = present_views(photo_set, self.downscale)
         given = torch.tensor([view.is_test for view in photo_set.views]) if photo_set.has_split else None
         test = self._test_mask(given, len(photo_set.views), photo_set.name)
-        photos = load_photos(photo_set, self.downscale)
-        bounds, surroundings = self._find_bounds(photo_set, photos.cameras, photos.images, photos.alphas, test)
+        photos = load_photos(photo_set, self.downscale, self.keep_lens)
+        bounds, surroundings = self._find_bounds(photo_set, photos, test)
         return Capture(
             photos.cameras,
             photos.images,
@@ -125,11 +127,12 @@ class PhotoCapture:
     def _build_tiny_nerf(self, path: Path) -> Capture:
         content = read_tiny_nerf(path, self.downscale)
         cameras = [
-            make_camera(content.intrinsics, torch.from_numpy(pose), f"view {index} of '{path}'")
+            make_camera(content.intrinsics, torch.from_numpy(pose).float(), f"view {index} of '{path}'")
             for index, pose in enumerate(content.poses)
         ]
         test = self._test_mask(None, len(cameras), path.stem)
-        bounds, surroundings = self._find_bounds(PhotoSet(path.stem), cameras, content.images, content.alphas, test)
+        photos = Photos(cameras, content.images, content.alphas, None)
+        bounds, surroundings = self._find_bounds(PhotoSet(path.stem), photos, test)
         return Capture(
             cameras,
             content.images,
@@ -157,18 +160,12 @@ class PhotoCapture:
         every = _TEST_EVERY if self.test_every is None else self.test_every
         return torch.tensor([every > 0 and index % every == 0 for index in range(count)], dtype=torch.bool)
 
-    def _find_bounds(
-        self,
-        photo_set: PhotoSet,
-        cameras: list[Camera],
-        images: Images,
-        alphas: Images | None,
-        test: torch.Tensor,
-    ) -> tuple[torch.Tensor, float]:
+    def _find_bounds(self, photo_set: PhotoSet, photos: Photos, test: torch.Tensor) -> tuple[torch.Tensor, float]:
         """(2, 3) float32 bounds, and the surroundings' factor; only images for training are looked at."""
+        cameras = photos.cameras
         train = (~test).nonzero().flatten().tolist() or list(range(len(cameras)))
         seeing = [cameras[view] for view in train]
-        masks = silhouettes(images, alphas, train)
+        masks = silhouettes(photos.images, photos.alphas, train, photos.valid)
         if self.bounds is not None:
             box = np.array(self.bounds, dtype=np.float64).reshape(2, 3)
         elif photo_set.bounds is not None:

@@ -17,10 +17,11 @@ import torch
 
 from difftetvr.capture.packed import Images, Masks, MixedImages, PackedImages
 from difftetvr.capture.photos.image_file import ImageHeader, image_header, read_image, read_mask
-from difftetvr.capture.photos.lens import Intrinsics
+from difftetvr.capture.photos.lens import make_camera
 from difftetvr.capture.photos.photo_set import CaptureWarning, PhotoSet, View
-from difftetvr.capture.photos.undistort import pinhole_of, undistorted, undistorted_mask
-from difftetvr.errors import CameraError, CaptureError
+from difftetvr.capture.photos.undistort import known_pixels, pinhole_of, undistorted, undistorted_mask
+from difftetvr.errors import CaptureError
+from difftetvr.rendering.cameras.intrinsics import Intrinsics
 from difftetvr.rendering.cameras.pinhole import Camera
 from difftetvr.trust import UNPACKED_BYTES, free_memory, require_free
 
@@ -40,7 +41,7 @@ class Photos:
     """Images in memory, with their cameras.
 
     Attributes:
-        cameras: N pinhole cameras.
+        cameras: N cameras: pinholes, or those of the lenses that were kept.
         images: (N, H, W, 3) as stored in the files, premultiplied over black, or of several sizes.
         alphas: (N, H, W) likewise, None where all images are opaque.
         valid: (N, H, W) bool likewise, None where no pixel is masked.
@@ -54,13 +55,25 @@ class Photos:
 
 @dataclass(frozen=True, eq=False)
 class _Plan:
-    """How one image becomes a view: its file, averaged over blocks, seen through a pinhole instead of its lens."""
+    """How one image becomes a view: its file, averaged over blocks, and what it is then seen through.
+
+    Attributes:
+        view: The view.
+        shrink: Pixels of the file along x and y that are averaged to one.
+        mask_shrinks: By how much its mask may have to be shrunk.
+        lens: What the image was taken with.
+        seen: What the view has: the same, or a pinhole instead.
+        known: (H, W) bool, pixels that a lens that is kept can have made; None for all.
+        file: The image's file.
+        header: Its header.
+    """
 
     view: View
     shrink: int
     mask_shrinks: tuple[int, ...]
     lens: Intrinsics
-    pinhole: Intrinsics
+    seen: Intrinsics
+    known: torch.Tensor | None
     file: Path
     header: ImageHeader
 
@@ -68,25 +81,27 @@ class _Plan:
     def working_bytes(self) -> int:
         """Memory that loading it takes for a while."""
         pixels = self.lens.width * self.lens.height
-        per_pixel = _BYTES_OF_READING if self.lens == self.pinhole else _BYTES_OF_UNDISTORTING
+        per_pixel = _BYTES_OF_READING if self.lens == self.seen else _BYTES_OF_UNDISTORTING
         return self.header.decoding_bytes(self.shrink) + per_pixel * pixels
 
 
-def load_photos(photo_set: PhotoSet, downscale: int) -> Photos:
+def load_photos(photo_set: PhotoSet, downscale: int, keep_lens: bool = False) -> Photos:
     """Decode the images in parallel, shrink and undistort them.
 
     Args:
         photo_set: What a reader found; its views must all have a file.
         downscale: Pixels of the original along x and y that become one.
+        keep_lens: Whether they are left distorted. Pixels that their lens cannot have made are masked then.
 
     Raises:
         CaptureError: An image cannot be read, sizes do not fit, or there is not enough memory.
     """
-    plans = [_plan(view, downscale) for view in photo_set.views]
+    plans = [_plan(view, downscale, keep_lens) for view in photo_set.views]
     _warn_of_16_bits(plans, photo_set)
-    sizes = _sizes([plan.pinhole for plan in plans], photo_set)
+    _warn_of_unknown(plans, photo_set)
+    sizes = _sizes([plan.seen for plan in plans], photo_set)
     cameras = [_camera(plan, size) for plan, size in zip(plans, sizes, strict=True)]
-    channels = 3 + (0 if all(plan.view.mask is None for plan in plans) else 1)
+    channels = 3 + (0 if all(plan.view.mask is None and plan.known is None for plan in plans) else 1)
     pixels = sum(width * height for width, height in sizes)
     advice = "shrink them more with a larger downscale"
     require_free(channels * pixels, f"The images of '{photo_set.name}'", advice, CaptureError)
@@ -187,20 +202,7 @@ def fitting_downscale(photo_set: PhotoSet, longest_side: int) -> int:
     return 1
 
 
-def make_camera(intrinsics: Intrinsics, pose: torch.Tensor, where: str) -> Camera:
-    """A camera.
-
-    Raises:
-        CaptureError: A value is out of range.
-    """
-    i = intrinsics
-    try:
-        return Camera(pose.to(torch.float32), i.fx, i.fy, i.cx, i.cy, i.width, i.height)
-    except CameraError as error:
-        raise CaptureError(f"The camera of {where} is not valid: {error}") from None
-
-
-def _plan(view: View, downscale: int) -> _Plan:
+def _plan(view: View, downscale: int, keep_lens: bool) -> _Plan:
     found = view.file(downscale)
     if found is None:
         raise CaptureError(f"The image {view.label} is missing; get the capture anew.")
@@ -219,16 +221,21 @@ def _plan(view: View, downscale: int) -> _Plan:
         raise CaptureError(f"The image '{file}' has {size[0]} x {size[1]} pixels, too few to shrink by {shrink}.")
     lens = view.lens.on(*full, view.label).resized(*size).shrunk(shrink)
     # Masks may be of the photographs, or shrunk as their smaller copies are.
-    return _Plan(view, shrink, (downscale, shrink), lens, pinhole_of(lens, view.label), file, header)
+    masks = (downscale, shrink)
+    if keep_lens:
+        return _Plan(view, shrink, masks, lens, lens, known_pixels(lens, view.label), file, header)
+    return _Plan(view, shrink, masks, lens, pinhole_of(lens, view.label), None, file, header)
 
 
 def _load(plan: _Plan) -> tuple[np.ndarray, np.ndarray | None]:
     """(H, W, 3 or 4) uint8 values of a view, and its (H, W) mask, if it has one."""
     image = read_image(plan.file, plan.shrink)
     mask = None if plan.view.mask is None else _load_mask(plan, plan.view.mask)
-    if plan.lens != plan.pinhole:
-        image = undistorted(image, plan.lens, plan.pinhole)
-        mask = None if mask is None else undistorted_mask(mask, plan.lens, plan.pinhole)
+    if plan.lens != plan.seen:
+        image = undistorted(image, plan.lens, plan.seen)
+        mask = None if mask is None else undistorted_mask(mask, plan.lens, plan.seen)
+    if plan.known is not None:
+        mask = plan.known if mask is None else mask & plan.known
     return (image * 255.0).round_().to(torch.uint8).numpy(), None if mask is None else mask.numpy()
 
 
@@ -245,6 +252,17 @@ def _warn_of_16_bits(plans: Sequence[_Plan], photo_set: PhotoSet) -> None:
     if deep:
         warnings.warn(
             f"{len(deep)} of the images of '{photo_set.name}', such as {deep[0]}, have 16 bits a channel; 8 are kept.",
+            CaptureWarning,
+            stacklevel=3,
+        )
+
+
+def _warn_of_unknown(plans: Sequence[_Plan], photo_set: PhotoSet) -> None:
+    partly = [plan.view.label for plan in plans if plan.known is not None]
+    if partly:
+        warnings.warn(
+            f"{len(partly)} of the images of '{photo_set.name}', such as {partly[0]}, have pixels that their lens "
+            "cannot have made, by its parameters; these are masked.",
             CaptureWarning,
             stacklevel=3,
         )
@@ -269,5 +287,5 @@ def _sizes(intrinsics: Sequence[Intrinsics], photo_set: PhotoSet) -> list[tuple[
 
 
 def _camera(plan: _Plan, size: tuple[int, int]) -> Camera:
-    cropped = replace(plan.pinhole, width=size[0], height=size[1])
-    return make_camera(cropped, torch.from_numpy(plan.view.world_to_camera), plan.view.label)
+    cropped = replace(plan.seen, width=size[0], height=size[1])
+    return make_camera(cropped, torch.from_numpy(plan.view.world_to_camera).float(), plan.view.label)

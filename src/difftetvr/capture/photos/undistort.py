@@ -1,15 +1,17 @@
-"""Photographs without the distortion of their lens."""
+"""Photographs without the distortion of their lens, or with it."""
 
 from __future__ import annotations
 
 from functools import lru_cache
 
-import numpy as np
 import torch
 
-from difftetvr.capture.photos.lens import Intrinsics
 from difftetvr.errors import CaptureError
+from difftetvr.rendering.cameras.intrinsics import Intrinsics, field_of_view
 from difftetvr.srgb import linear_to_srgb, srgb_to_linear
+
+_EDGE = 129  # places along each edge of a photograph that are looked at
+_LEAST_KNOWN = 0.5  # of the pixels
 
 
 def pinhole_of(lens: Intrinsics, where: str) -> Intrinsics:
@@ -23,24 +25,48 @@ def pinhole_of(lens: Intrinsics, where: str) -> Intrinsics:
         where: What they belong to, for messages.
 
     Raises:
-        CaptureError: The distortion folds the image, as no lens does.
+        CaptureError: The distortion folds the image, as no lens does, or the lens is a fisheye.
     """
     if lens.distortion.is_none:
         return lens
-    across, down = np.linspace(0, lens.width, 129), np.linspace(0, lens.height, 129)
-    left, right = (_edge(lens, np.full_like(down, x), down)[:, 0] for x in (0.0, float(lens.width)))
-    top, bottom = (_edge(lens, across, np.full_like(across, y))[:, 1] for y in (0.0, float(lens.height)))
-    lower = np.array([left.max(), top.max()])
-    upper = np.array([right.min(), bottom.min()])
+    if lens.distortion.is_fisheye:
+        raise CaptureError(
+            f"The lens of {where} is a fisheye, which no pinhole can stand for; keep it (keep_lens, on the command "
+            "line --keep-lens), or undistort its images first."
+        )
+    across, down = (torch.linspace(0, side, _EDGE, dtype=torch.float64) for side in (lens.width, lens.height))
+    left, right = (_edge(lens, torch.full_like(down, x), down)[:, 0] for x in (0.0, lens.width))
+    top, bottom = (_edge(lens, across, torch.full_like(across, y))[:, 1] for y in (0.0, lens.height))
+    lower = torch.stack([left.max(), top.max()])
+    upper = torch.stack([right.min(), bottom.min()])
     # NaN, of edges that the lens cannot have made, fails this test, too.
-    if not (lower < upper).all():
+    if not bool((lower < upper).all()):
         raise _folds(where)
-    fx, fy = (float(focal) for focal in (lens.width, lens.height) / (upper - lower))
-    pinhole = Intrinsics(fx, fy, -float(lower[0]) * fx, -float(lower[1]) * fy, lens.width, lens.height)
-    coarse = np.stack(np.meshgrid(across, down), axis=-1)
-    if not lens.distortion.keeps_orientation(pinhole.to_normalised(coarse)).all():
+    (x, y), (across_seen, down_seen) = lower.tolist(), (upper - lower).tolist()
+    fx, fy = lens.width / across_seen, lens.height / down_seen
+    pinhole = Intrinsics(fx, fy, -x * fx, -y * fy, lens.width, lens.height)
+    coarse = torch.stack(torch.meshgrid(across, down, indexing="xy"), dim=-1)
+    if not bool(lens.distortion.keeps_orientation(pinhole.to_normalised(coarse)).all()):
         raise _folds(where)
     return pinhole
+
+
+def known_pixels(lens: Intrinsics, where: str) -> torch.Tensor | None:
+    """(H, W) bool, the pixels of a photograph that its lens can have made; None where it can have made all.
+
+    Args:
+        lens: Intrinsics that the image was taken with.
+        where: What they belong to, for messages.
+
+    Raises:
+        CaptureError: The distortion folds half of the image or more, as no lens does.
+    """
+    if lens.distortion.is_none:
+        return None
+    known = field_of_view(lens).known
+    if float(known.float().mean()) <= _LEAST_KNOWN:
+        raise _folds(where)
+    return None if bool(known.all()) else known
 
 
 def undistorted(image: torch.Tensor, lens: Intrinsics, pinhole: Intrinsics) -> torch.Tensor:
@@ -88,14 +114,12 @@ def undistorted_mask(mask: torch.Tensor, lens: Intrinsics, pinhole: Intrinsics) 
 @lru_cache(maxsize=2)
 def _sampling_grid(lens: Intrinsics, pinhole: Intrinsics) -> torch.Tensor:
     """(1, H, W, 2) places in the photograph of the pinhole's pixels, -1 to 1 from edge to edge."""
-    x, y = np.arange(pinhole.width) + 0.5, np.arange(pinhole.height) + 0.5
-    pixels = np.stack(np.meshgrid(x, y), axis=-1)
-    source = lens.to_pixels(lens.distortion.distort(pinhole.to_normalised(pixels)))
-    return torch.from_numpy((2.0 * source / (lens.width, lens.height) - 1.0).astype(np.float32))[None]
+    source = lens.to_pixels(lens.distortion.distort(pinhole.to_normalised(pinhole.pixel_centers())))
+    return (2.0 * source / source.new_tensor([lens.width, lens.height]) - 1.0).float()[None]
 
 
-def _edge(lens: Intrinsics, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    return lens.distortion.undistort(lens.to_normalised(np.stack([x, y], axis=-1)))
+def _edge(lens: Intrinsics, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+    return lens.distortion.undistort(lens.to_normalised(torch.stack([x, y], dim=-1)))
 
 
 def _folds(where: str) -> CaptureError:

@@ -77,8 +77,10 @@ class VolumeRenderer:
             Images (N, H, W, 3), linear RGB premultiplied over black, and alphas (N, H, W), both on the CPU.
 
         Raises:
-            CaptureError: No camera is given, or the image sizes differ.
+            CaptureError: No camera is given, one is no pinhole, or the image sizes differ.
         """
+        if any(type(camera) is not Camera for camera in cameras):
+            raise CaptureError("Volumes are rendered for pinhole cameras alone; pass difftetvr.Camera without a lens.")
         if not cameras or len({(camera.width, camera.height) for camera in cameras}) != 1:
             raise CaptureError("The views of a capture need at least one camera and one common image size.")
         width, height = cameras[0].width, cameras[0].height

@@ -26,6 +26,7 @@ from difftetvr.files import atomic_write, locked, remove_leftovers, stem_of
 from difftetvr.fitting.config import FitConfig
 from difftetvr.fitting.records.history import History
 from difftetvr.mesh.tetmesh import TetMesh
+from difftetvr.rendering.cameras.lens import LensCamera
 
 _VERSION = 5
 _HISTORY = ("history.loss", "history.psnr")
@@ -227,6 +228,7 @@ def _unreadable(source: str | Path, why: str) -> FitError:
 def describe_capture(capture: Capture) -> dict[str, Any]:
     """What tells one set of images from another: numbers that are compared when a run is resumed."""
     widths, heights = (sorted(set(sides)) for sides in zip(*capture.image_sizes, strict=True))
+    lenses = sum(isinstance(camera, LensCamera) for camera in capture.cameras)
     return {
         "views": len(capture.cameras),
         "width": widths[0] if len(widths) == 1 else widths,
@@ -234,6 +236,7 @@ def describe_capture(capture: Capture) -> dict[str, Any]:
         "test_views": capture.test_indices.tolist(),
         "density_unit": float(capture.density_unit),
         "mean_radiance": float(capture.images.mean(dtype=torch.float64)),
+        "lenses": lenses,
     }
 
 
@@ -244,7 +247,7 @@ def require_same_capture(saved: dict[str, Any], current: dict[str, Any]) -> None
         FitError: A description differs; names the first one.
     """
     for name, value in current.items():
-        before = saved.get(name)
+        before = saved.get(name, 0)  # "lenses" are absent from checkpoints of before there were any
         if isinstance(before, float) and isinstance(value, float):
             same = math.isclose(before, value, rel_tol=1e-5)
         else:

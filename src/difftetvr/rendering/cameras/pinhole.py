@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 
 from difftetvr.errors import CameraError, shown
 from difftetvr.inputs import as_reals
 from difftetvr.rendering.cameras.checks import number, pixels, take_pose, take_size
+from difftetvr.rendering.cameras.distortion import Distortion, through_plane
 from difftetvr.rendering.cameras.rigid import pencil, transformed
 
 if TYPE_CHECKING:
@@ -163,13 +164,39 @@ class Camera:
 
     def plane_points(self) -> torch.Tensor:
         """(H, W, 2) where the pixels' centres lie in the plane at distance 1, float64; differentiable likewise."""
-        fx, fy, cx, cy = (
-            (self.fx, self.fy, self.cx, self.cy) if self.intrinsics is None else self.intrinsics.double().cpu().unbind()
-        )
+        fx, fy, cx, cy = self._pinhole(torch.float64, "cpu")
         x = (torch.arange(self.width, dtype=torch.float64) + 0.5 - cx) / fx
         y = (torch.arange(self.height, dtype=torch.float64) + 0.5 - cy) / fy
         rows, columns = torch.meshgrid(y, x, indexing="ij")
         return torch.stack([columns, rows], dim=-1)
+
+    def project(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Where points are seen; differentiable in them and in all parameters.
+
+        Beside the image, where the formulas of a lens may fold, what it does at the image's rim goes on in proportion;
+        derivatives there leave out that the rim moves.
+
+        Args:
+            points: (N, 3) in world space.
+
+        Returns:
+            (N, 2) pixels, which may lie outside of the image; and (N,) how many pixels a step of length 1 across the
+            line of sight covers there. Where that is not greater than 0, points are behind the camera and not seen.
+        """
+        flat, enlarged = self._flattened(self.to_camera_space(points))
+        fx, fy, cx, cy = self._pinhole(flat.dtype, flat.device)
+        x, y = flat.unbind(-1)
+        return torch.stack([x * fx + cx, y * fy + cy], dim=-1), enlarged * max(self.fx, self.fy)
+
+    def _flattened(self, places: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """(N, 2) where places in camera space are seen in the plane at distance 1, and (N,) by how much enlarged."""
+        return Distortion().coordinates(places)
+
+    def _pinhole(self, dtype: torch.dtype, device: torch.device | str) -> Sequence[Any]:
+        """fx, fy, cx and cy: numbers, or tensors where images are differentiable in them."""
+        if self.intrinsics is None:
+            return self.fx, self.fy, self.cx, self.cy
+        return self.intrinsics.to(device, dtype).unbind()
 
     def rays(self) -> Rays:
         """The rays of all pixels in world space, (H, W); differentiable in extrinsics and intrinsics."""
@@ -207,9 +234,3 @@ class Camera:
     def with_pose(self, world_to_camera: torch.Tensor) -> Camera:
         """The same intrinsics with other extrinsics."""
         return replace(self, world_to_camera=world_to_camera)
-
-
-def through_plane(points: torch.Tensor) -> torch.Tensor:
-    """(..., 3) unit directions through (..., 2) points of the plane at distance 1; differentiable."""
-    directions = torch.cat([points, torch.ones_like(points[..., :1])], dim=-1)
-    return directions / directions.norm(dim=-1, keepdim=True)

@@ -17,6 +17,7 @@ from capture.photos.photo_scene import CAMERA, FOCAL, HEIGHT, POINTS, WIDTH, pro
 from difftetvr.capture import CaptureWarning, load_capture
 from difftetvr.capture.photos.readers.colmap import read_colmap_model
 from difftetvr.errors import CaptureError
+from difftetvr.rendering import LensCamera
 
 BOX = (-1.0, -1.5, -1.0, 1.5, 1.0, 1.5)
 MIDDLE = (WIDTH / 2, HEIGHT / 2)
@@ -69,12 +70,34 @@ def test_camera_models(tmp_path: Path, suffix: str, model, parameters, distortio
     write_colmap(tmp_path, suffix, model, parameters)
     lens = read_colmap_model(tmp_path / "sparse" / "0").cameras[7]
     assert (lens.fx, lens.fy, lens.cx, lens.cy) == (FOCAL, FOCAL, *MIDDLE)
-    assert {key: value for key, value in vars(lens.distortion).items() if value} == distortion
+    assert {key: value for key, value in lens.distortion.values.items() if value} == distortion
     assert load_capture(tmp_path).images.shape == (16, HEIGHT, WIDTH, 3)
 
 
+@pytest.mark.parametrize(
+    ("model", "parameters", "lens"),
+    [
+        ((5, "OPENCV_FISHEYE"), (FOCAL, FOCAL, *MIDDLE, 0.01, 0.02, 0.003, 0.004), "fisheye"),
+        ((8, "SIMPLE_RADIAL_FISHEYE"), (FOCAL, *MIDDLE, 0.01), "fisheye"),
+        ((9, "RADIAL_FISHEYE"), (FOCAL, *MIDDLE, 0.01, 0.02), "fisheye"),
+        ((10, "THIN_PRISM_FISHEYE"), (FOCAL, FOCAL, *MIDDLE, *np.arange(1, 9) * 1e-3), "thin-prism-fisheye"),
+    ],
+)
 @pytest.mark.parametrize("suffix", [".bin", ".txt"])
-@pytest.mark.parametrize("model", [(5, "OPENCV_FISHEYE"), (7, "FOV"), (99, "MADE_UP")])
+def test_fisheyes_are_kept(tmp_path: Path, suffix: str, model, parameters, lens: str) -> None:
+    write_colmap(tmp_path, suffix, model, parameters)
+    with pytest.raises(CaptureError, match=r"is a fisheye, .*--keep-lens") as error:
+        load_capture(tmp_path)
+    check_sentence(error.value)
+    camera = load_capture(tmp_path, keep_lens=True).cameras[3]
+    assert isinstance(camera, LensCamera) and camera.model == lens
+    coefficients = parameters[4:] if parameters[1] == FOCAL else parameters[3:]
+    np.testing.assert_array_equal(camera.coefficients, coefficients)
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (FOCAL, FOCAL, *MIDDLE)
+
+
+@pytest.mark.parametrize("suffix", [".bin", ".txt"])
+@pytest.mark.parametrize("model", [(7, "FOV"), (11, "RAD_TAN_THIN_PRISM_FISHEYE"), (99, "MADE_UP")])
 def test_other_camera_models_are_refused(tmp_path: Path, suffix: str, model: tuple[int, str]) -> None:
     write_colmap(tmp_path, suffix, model, (1.0,) * 8)
     with pytest.raises(CaptureError, match="not supported; undistort") as error:

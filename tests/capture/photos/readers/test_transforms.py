@@ -236,8 +236,11 @@ def test_absent_images(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("top", "message"),
     [
-        ({"camera_model": "OPENCV_FISHEYE"}, "camera model .*OPENCV_FISHEYE"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "camera model .*EQUIRECTANGULAR"),
+        ({"camera_model": 3}, "camera model .* is 3"),
+        ({"camera_model": "OPENCV_FISHEYE"}, "is a fisheye, .* --keep-lens"),
         ({"is_fisheye": True}, "fisheye"),
+        ({"is_fisheye": True, "p1": 0.1}, "distortion p1, which the lens model 'fisheye'"),
         ({"k4": 0.1}, "k4"),
         ({"k1": -3.0}, "folds the image"),
         ({"k1": float("inf")}, "finite number"),

@@ -10,11 +10,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 
-from difftetvr.capture.photos.lens import Distortion, Lens
+from difftetvr.capture.photos.lens import Lens, make_camera
 from difftetvr.errors import CaptureError
+from difftetvr.rendering.cameras.distortion import Distortion
+from difftetvr.rendering.cameras.lens_models import COLMAP_CAMERAS
 
-# Names by the number that binary files use, and what each model's parameters are.
+# By the number that binary files use.
 MODEL_NAMES = (
     "SIMPLE_PINHOLE",
     "PINHOLE",
@@ -29,14 +32,6 @@ MODEL_NAMES = (
     "THIN_PRISM_FISHEYE",
     "RAD_TAN_THIN_PRISM_FISHEYE",
 )
-_PARAMETERS = {
-    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
-    "PINHOLE": ("fx", "fy", "cx", "cy"),
-    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
-    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
-    "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
-    "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,12 +93,13 @@ class ColmapModel:
         for image in self.images:
             place = np.searchsorted(ids, image.point_ids).clip(0, max(len(ids) - 1, 0))
             known = (ids[place] == image.point_ids) if len(ids) else np.zeros(len(image.point_ids), dtype=bool)
-            pose, lens = image.world_to_camera, self.cameras[image.camera_id]
-            intrinsics = lens.on(lens.width or 1, lens.height or 1, f"'{image.name}'")
+            lens, where = self.cameras[image.camera_id], f"'{image.name}'"
+            intrinsics = lens.on(lens.width or 1, lens.height or 1, where)
+            camera = make_camera(intrinsics, torch.from_numpy(image.world_to_camera), where)
+            pixels, enlarged = (part.numpy() for part in camera.project(torch.from_numpy(positions[place[known]])))
             with np.errstate(all="ignore"):
-                points = positions[place[known]] @ pose[:3, :3].T + pose[:3, 3]
-                distances = np.linalg.norm(intrinsics.project(points) - image.keypoints[known], axis=1)
-            errors.append(np.where((points[:, 2] > 0) & np.isfinite(distances), distances, np.inf))
+                distances = np.linalg.norm(pixels - image.keypoints[known], axis=1)
+            errors.append(np.where((enlarged > 0) & np.isfinite(distances), distances, np.inf))
         return np.concatenate(errors)
 
 
@@ -113,12 +109,12 @@ def parameter_count(model: str, where: str) -> int:
     Raises:
         CaptureError: The model is not supported.
     """
-    if model not in _PARAMETERS:
+    if model not in COLMAP_CAMERAS:
         raise CaptureError(
             f"The model of {where} is {model}, which is not supported; undistort the images first "
             "(colmap image_undistorter)."
         )
-    return len(_PARAMETERS[model])
+    return len(COLMAP_CAMERAS[model].parameters)
 
 
 def lens_of(model: str, size: tuple[int, int], values: np.ndarray, where: str) -> Lens:
@@ -140,11 +136,12 @@ def lens_of(model: str, size: tuple[int, int], values: np.ndarray, where: str) -
         raise CaptureError(
             f"The size of {where} is {size[0]} x {size[1]} pixels, which is no image; get the model anew."
         )
-    named = dict(zip(_PARAMETERS[model], map(float, values), strict=True))
+    kind = COLMAP_CAMERAS[model]
+    named = dict(zip(kind.parameters, map(float, values), strict=True))
     focal = named.pop("f", None)
     fx, fy = named.pop("fx", focal), named.pop("fy", focal)
     cx, cy = named.pop("cx"), named.pop("cy")
-    lens = Lens(fx, fy, cx, cy, width=size[0], height=size[1], distortion=Distortion(**named))
+    lens = Lens(fx, fy, cx, cy, width=size[0], height=size[1], distortion=Distortion.named(kind.model, named))
     lens.on(*size, where)
     return lens
 

@@ -9,9 +9,10 @@ import numpy as np
 import torch
 
 from difftetvr.archive import array_names, read_arrays
-from difftetvr.capture.photos.lens import Intrinsics, Lens
+from difftetvr.capture.photos.lens import Lens
 from difftetvr.capture.photos.poses import from_opengl
 from difftetvr.errors import CaptureError
+from difftetvr.rendering.cameras.intrinsics import Intrinsics
 from difftetvr.trust import require_modest
 
 _KEYS = ("images", "poses", "focal")

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from difftetvr.capture.photos.lens import Distortion, Lens
+from difftetvr.capture.photos.lens import Lens
 from difftetvr.capture.photos.photo_set import (
     CaptureWarning,
     PhotoSet,
@@ -30,9 +30,11 @@ from difftetvr.capture.photos.photo_set import (
 from difftetvr.capture.photos.poses import from_opengl
 from difftetvr.capture.photos.readers.ply_points import read_ply_points
 from difftetvr.errors import CaptureError, shown
+from difftetvr.rendering.cameras.distortion import Distortion
+from difftetvr.rendering.cameras.lens_models import LENS_MODELS, TRANSFORMS_CAMERAS
 from difftetvr.trust import file_beside
 
-_PINHOLES = ("", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL")
+_FISHEYE = "OPENCV_FISHEYE"  # what is_fisheye of instant-ngp stands for
 # What changes nothing here, although the file says it.
 _UNUSED = {
     "depth_file_path": "depth maps (depth_file_path)",
@@ -67,7 +69,8 @@ def read_nerf_synthetic(folder: Path) -> PhotoSet:
 def read_transforms(path: Path) -> PhotoSet:
     """A transforms.json of nerfstudio or instant-ngp.
 
-    Intrinsics may stand at the top or, overriding that, in each frame. Distortion is OpenCV's k1, k2, p1, p2, k3.
+    Intrinsics may stand at the top or, overriding that, in each frame. Distortion is OpenCV's k1, k2, p1, p2, k3, that
+    of fisheyes its k1, k2, k3, k4.
     nerfstudio's lists of ``train_filenames`` and ``test_filenames`` (or ``val_filenames``) are kept to.
     The points of its ``ply_file_path`` are the sparse points.
     Where there is an ``aabb_scale``, the bounds are instant-ngp's unit cube, by its ``scale`` and ``offset``.
@@ -135,17 +138,24 @@ def _views(file: Path, content: dict[str, Any], is_test: bool) -> list[View]:
 
 def _lens(values: dict[str, Any], where: str) -> Lens:
     model = values.get("camera_model") or ""
-    if values.get("is_fisheye") or not isinstance(model, str) or model.upper() not in _PINHOLES:
+    if not isinstance(model, str) or model.upper() not in TRANSFORMS_CAMERAS:
         raise CaptureError(
-            f"The camera model of {where} is {shown(model or 'a fisheye')}; undistort its images to a pinhole first."
+            f"The camera model of {where} is {shown(model)}, which is not known; undistort its images to a pinhole "
+            "first."
         )
+    kind = TRANSFORMS_CAMERAS[_FISHEYE if values.get("is_fisheye") else model.upper()]
 
     def number(key: str) -> float | None:
         return number_of(values, key, where)
 
-    if number("k4"):
-        raise CaptureError(f"{where[0].upper()}{where[1:]} has the distortion k4, for fisheyes; undistort it first.")
-    distortion = Distortion(**{key: number(key) or 0.0 for key in ("k1", "k2", "p1", "p2", "k3")})
+    names = {name for lens in LENS_MODELS.values() for name in lens.coefficients}
+    others = sorted(key for key in names.difference(kind.parameters) if number(key))
+    if others:
+        raise CaptureError(
+            f"{where[0].upper()}{where[1:]} has the distortion {others[0]}, which the lens model '{kind.model}' is not "
+            f"read with; undistort it first."
+        )
+    coefficients = {key: number(key) or 0.0 for key in kind.parameters if key in names}
     return Lens(
         fx=number("fl_x"),
         fy=number("fl_y"),
@@ -155,7 +165,7 @@ def _lens(values: dict[str, Any], where: str) -> Lens:
         angle_y=number("camera_angle_y"),
         width=pixels_of(values, "w", where),
         height=pixels_of(values, "h", where),
-        distortion=distortion,
+        distortion=Distortion.named(kind.model, coefficients),
     )
 
 
