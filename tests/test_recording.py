@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -99,7 +101,7 @@ def test_exchanges_of_cells_compile_nothing(eye: tuple[float, float, float]) -> 
         image.color.square().sum().backward()
         assert values.grad is not None and bool(vertices.grad.any())
 
-    iterate(mesh)
+    launches(lambda: iterate(mesh))  # recordings are made anew where the history is kept
     sizes, launched, traced, compiled = set(), 0, 0, 0
     for seed in range(40):
         mesh = exchanged(mesh, seed)
@@ -108,4 +110,14 @@ def test_exchanges_of_cells_compile_nothing(eye: tuple[float, float, float]) -> 
         launched, traced, compiled = launched + new[0], traced + new[1], compiled + new[2]
     assert len(sizes) > 30
     # The sizes pass a few of the lengths that buffers have; only then anything is traced.
-    assert compiled <= 10 and traced < 0.25 * launched, (compiled, traced, launched)
+    assert compiled <= 10 and traced < 0.2 * launched, (compiled, traced, launched)
+
+
+def test_rendered_meshes_are_copied_and_pickled() -> None:
+    mesh = TetMesh.grid((3, 3, 3))
+    camera = Camera.look_at((3, 2, 2), (0.5, 0.5, 0.5), width=8, height=8)
+    field = Field(torch.rand(mesh.num_vertices, 3), torch.rand(mesh.num_vertices))
+    image = render(mesh, field, camera)
+    for other in (copy.deepcopy(mesh), pickle.loads(pickle.dumps(mesh))):
+        assert torch.equal(other.topology.cell_adjacency, mesh.topology.cell_adjacency)
+        assert torch.equal(render(other, field, camera).color, image.color)

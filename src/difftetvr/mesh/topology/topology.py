@@ -138,6 +138,11 @@ class Topology:
         known = None if adjacency is None else adjacency.to(device)
         return Topology(tets, self.num_vertices, known, is_conforming=self.is_conforming)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """What a copy, or a file, needs; other tables, which may hold arrays of kernels, are rebuilt on demand."""
+        adjacency = self._tables.get("cell_adjacency")
+        return {**self.__dict__, "_tables": {} if adjacency is None else {"cell_adjacency": adjacency}}
+
     def _build_cell_adjacency(self) -> torch.Tensor:
         if not self.is_conforming:
             raise MeshError(
