@@ -135,6 +135,8 @@ class Backend:
                 stacklevel=2,
             )
         with _TURN:
+            # Values of the forward pass may be asked for by autograd's thread, which Dr.Jit must be told of.
+            dr.detail.new_scope(dr.backend_v(self.Float))
             threads = dr.thread_count() if one_thread and self.name == "llvm" else 0
             if threads:
                 dr.set_thread_count(1)
