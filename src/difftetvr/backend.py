@@ -57,6 +57,7 @@ class Backend:
         Bool: Dr.Jit mask array.
         Float2: Vector of two ``Float``, gathered as one packet.
         Float4: Vector of four ``Float``, gathered as one packet.
+        Floats: Vector of any number of ``Float``, scattered as one packet.
         UInt2: Vector of two ``UInt``, gathered as one packet.
         UInt4: Vector of four ``UInt``, gathered as one packet.
     """
@@ -70,6 +71,7 @@ class Backend:
     Bool: Any
     Float2: Any
     Float4: Any
+    Floats: Any
     UInt2: Any
     UInt4: Any
 
@@ -229,6 +231,7 @@ def _started_backend(device: str, dtype: torch.dtype) -> Backend:
         Bool=types.Bool,
         Float2=getattr(types, f"Array2f{suffix}"),
         Float4=getattr(types, f"Array4f{suffix}"),
+        Floats=getattr(types, f"ArrayXf{suffix}"),
         UInt2=types.Array2u,
         UInt4=types.Array4u,
     )
