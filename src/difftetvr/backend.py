@@ -57,6 +57,7 @@ class Backend:
         Bool: Dr.Jit mask array.
         Float2: Vector of two ``Float``, gathered as one packet.
         Float4: Vector of four ``Float``, gathered as one packet.
+        Floats: Vector of any number of ``Float``, scattered as one packet.
         UInt2: Vector of two ``UInt``, gathered as one packet.
         UInt4: Vector of four ``UInt``, gathered as one packet.
     """
@@ -70,6 +71,7 @@ class Backend:
     Bool: Any
     Float2: Any
     Float4: Any
+    Floats: Any
     UInt2: Any
     UInt4: Any
 
@@ -103,13 +105,15 @@ class Backend:
         return _lanes(self.UInt, count)
 
     def run(self, *arrays: Any) -> None:
-        """Compute arrays and wait for them.
+        """Compute arrays, and wait for them unless PyTorch's work on the GPU waits by itself.
 
         Dr.Jit lets go of a view when its kernel is launched, not when it is done; without waiting, PyTorch could reuse
-        the memory of a temporary tensor that a kernel still reads.
+        the memory of a temporary tensor that a kernel still reads. Dr.Jit's stream on CUDA and PyTorch's default one
+        wait for each other.
         """
         dr.eval(*arrays)
-        dr.sync_thread()
+        if self.name != "cuda" or not self._is_on_default_stream:
+            dr.sync_thread()
 
     def tensor(self, array: Any, *shape: int) -> torch.Tensor:
         """PyTorch tensor over a Dr.Jit array's memory, without a copy; computes it first, see :meth:`run`."""
@@ -140,6 +144,8 @@ class Backend:
                 stacklevel=2,
             )
         with _TURN:
+            # Values of the forward pass may be asked for by autograd's thread, which Dr.Jit must be told of.
+            dr.detail.new_scope(dr.backend_v(self.Float))
             threads = dr.thread_count() if one_thread and self.name == "llvm" else 0
             if threads:
                 dr.set_thread_count(1)
@@ -150,6 +156,11 @@ class Backend:
                     dr.sync_thread()
                     dr.set_thread_count(threads)
 
+    @property
+    def _is_on_default_stream(self) -> bool:
+        """Whether PyTorch works on the stream that waits for Dr.Jit's, and that Dr.Jit's waits for."""
+        return bool(torch.cuda.current_stream(self.device) == torch.cuda.default_stream(self.device))
+
     def _ready(self, tensor: torch.Tensor) -> Any:
         """A tensor's values as kernels can read them: flat, where packets may begin, and written."""
         flat = tensor.contiguous().view(-1)
@@ -158,10 +169,8 @@ class Backend:
         if self.name == "cuda":
             if flat.data_ptr() % _PACKET_BYTES:
                 flat = flat.clone()  # loads of whole packets fault on views that begin in the midst of one
-            # Dr.Jit's stream and torch's default one wait for each other; torch's side streams do not.
-            stream = torch.cuda.current_stream(self.device)
-            if stream != torch.cuda.default_stream(self.device):
-                stream.synchronize()
+            if not self._is_on_default_stream:
+                torch.cuda.current_stream(self.device).synchronize()
         return flat
 
 
@@ -241,6 +250,7 @@ def _started_backend(device: str, dtype: torch.dtype) -> Backend:
         Bool=types.Bool,
         Float2=getattr(types, f"Array2f{suffix}"),
         Float4=getattr(types, f"Array4f{suffix}"),
+        Floats=getattr(types, f"ArrayXf{suffix}"),
         UInt2=types.Array2u,
         UInt4=types.Array4u,
     )

@@ -1,6 +1,7 @@
 """Unusual callers: several threads, extreme units of length, values that are not finite, arguments of wrong types."""
 
 import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
@@ -8,7 +9,7 @@ import torch
 from difftetvr.backend import dr
 from difftetvr.errors import CameraError, DiffTetError, MeshError
 from difftetvr.mesh import Field, TetMesh
-from difftetvr.rendering import Camera, render
+from difftetvr.rendering import Camera, Rays, render
 
 
 def scene(unit: float = 1.0, dtype: torch.dtype = torch.float32) -> tuple[TetMesh, Field, Camera]:
@@ -41,6 +42,19 @@ def test_threads_take_turns() -> None:
         thread.join()
     assert not wrong
     assert dr.thread_count() == threads_before
+
+
+def test_another_thread_may_go_backward_time_and_again() -> None:
+    """As autograd's own does on GPUs: it uses what kernels of the forward pass have left, evaluated or not."""
+    mesh, field, _ = scene()
+    directions = torch.tensor([0.5, 0.5, 0.5]) - torch.rand(40, 3, generator=torch.Generator().manual_seed(0)) - 1.0
+    with ThreadPoolExecutor(1) as other:
+        for _ in range(3):
+            density = field.density.clone().requires_grad_()
+            rays = Rays(mesh.vertices.mean(0) - 2.0 * directions, directions)
+            loss = render(mesh, Field(field.color, density), rays).color.sum()
+            other.submit(loss.backward).result()
+            assert density.grad is not None and float(density.grad.abs().sum()) > 0
 
 
 @pytest.mark.parametrize("unit", [1e-20, 1e-17, 1e-9, 1e9, 1e19])

@@ -16,6 +16,7 @@ that underestimates the curvature of a few edges, in random Delaunay meshes by u
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import Any
 
@@ -38,7 +39,7 @@ from difftetvr.rendering.traversal.crossing import (
     read_vertex,
 )
 from difftetvr.rendering.traversal.rays import Lanes
-from difftetvr.rendering.traversal.walk import Corner, Face
+from difftetvr.rendering.traversal.walk import Corner, Exit, Face
 
 RECORD = 12
 """Floats a hat: colour gradient (3), density gradient, sums of B^2, B D (3), D^2, B, and two of padding."""
@@ -46,9 +47,11 @@ RECORD = 12
 _SAMPLES = 4
 """Pieces of a crossing on which hats, colour and density are taken as constant."""
 
+_PLACES = [(k + 0.5) / _SAMPLES for k in range(_SAMPLES)]
+
 _UNKNOWN = 0xFFFFFFFF
-_FACE_EDGES = ((1, 2), (2, 0), (0, 1))  # edge k of the entry face is opposite corner k
-_APEX = 3
+# A cell's corners in a kernel: the one that the walk drops, those that follow in the entry face's turn, and the apex.
+_DROPPED, _AFTER, _BEFORE, _APEX = range(4)
 
 Response = list[Any]  # B, D_r, D_g, D_b
 
@@ -111,25 +114,24 @@ class HatRay:
 
 @dataclass
 class _Samples:
-    """One cell's crossing, piece by piece: response to a change at the piece, and barycentric coordinates there."""
+    """One cell's crossing, piece by piece.
+
+    Attributes:
+        responses: To a change at each piece.
+        first, last: Barycentric coordinates of the cell's corners where the crossing begins and ends.
+    """
 
     responses: list[Response]
-    weights: list[list[Any]]
+    first: list[Any]
+    last: list[Any]
 
-    def respond(self, corners: tuple[int, ...]) -> Response:
-        """Response of the hat over some of the cell's corners, 0 to 2 of the entry face and 3 the apex."""
-        total: Response | None = None
-        for response, weights in zip(self.responses, self.weights, strict=True):
-            hat = weights[corners[0]]
-            for corner in corners[1:]:
-                hat = dr.fmin(hat, weights[corner])
-            hat = hat * float(len(corners))
-            total = (
-                [hat * r for r in response]
-                if total is None
-                else [dr.fma(hat, r, t) for r, t in zip(response, total, strict=True)]
-            )
-        assert total is not None
+    def respond(self, *corners: int) -> Response:
+        """Response of the hat over some corners."""
+        total: Response = []
+        for x, response in zip(_PLACES, self.responses, strict=True):
+            weights = [dr.fma(x, self.last[k] - self.first[k], self.first[k]) for k in corners]
+            hat = functools.reduce(dr.fmin, weights) * float(len(corners))
+            total = [dr.fma(hat, r, t) for r, t in zip(response, total)] or [hat * r for r in response]
         return total
 
 
@@ -187,8 +189,10 @@ class _HatKernel:
     def visit(self, step: Step, ray: HatRay) -> HatRay:
         samples, transmittance, rest = self._sample(step, ray)
         self._finish_vertices(step, samples)
-        edges, edge_ids = self._finish_edges(step, ray, samples)
-        return HatRay(transmittance, rest, edges, edge_ids, self._finish_faces(step, ray, samples))
+        vertices = [*_turned(step.exit, [corner.vertex for corner in step.face.corners]), step.apex.vertex]
+        cell = _RankedCell(self.tables, step.cell, _ranks(vertices))
+        edges, edge_ids = self._finish_edges(step.exit, ray, samples, cell)
+        return HatRay(transmittance, rest, edges, edge_ids, self._finish_faces(ray, samples, cell))
 
     def goes_on(self, ray: HatRay) -> Any:
         return ray.transmittance > self.view.threshold
@@ -216,9 +220,8 @@ class _HatKernel:
         length = dr.fmax(leaving[0] - entry[0], 0.0)
         piece = length * (1.0 / _SAMPLES)
         transmittance, rest = ray.transmittance, ray.rest
-        samples = _Samples([], [])
-        for k in range(_SAMPLES):
-            x = (k + 0.5) / _SAMPLES
+        responses = []
+        for x in _PLACES:
             density, *color = (dr.fma(x, v1 - v0, v0) for v0, v1 in zip(entry[1:], leaving[1:], strict=True))
             opacity = 1.0 - dr.exp(-density * piece)
             seen = transmittance * opacity
@@ -226,88 +229,107 @@ class _HatKernel:
             rest = [dr.fma(-seen, c, r) for c, r in zip(color, rest, strict=True)]
             # More density here shows more of this piece and dims all that lies behind it.
             dims = [piece * dr.fma(transmittance, c, -r) for c, r in zip(color, rest, strict=True)]
-            samples.responses.append([seen, *dims])
-            samples.weights.append([dr.fma(x, w1 - w0, w0) for w0, w1 in zip(first, last, strict=True)])
+            responses.append([seen, *dims])
         # The state goes on exactly: errors of the pieces do not add up along the ray.
         w0, w1, through = self.view.optics.weights(length, entry[1], leaving[1])
         w0, w1 = w0 * ray.transmittance, w1 * ray.transmittance
         colors = zip(entry[2:], leaving[2:], ray.rest, strict=True)
-        return samples, ray.transmittance * through, [r - dr.fma(w0, c0, w1 * c1) for c0, c1, r in colors]
+        behind = [r - dr.fma(w0, c0, w1 * c1) for c0, c1, r in colors]
+        return _Samples(responses, first, last), ray.transmittance * through, behind
 
     def _finish_vertices(self, step: Step, samples: _Samples) -> None:
-        for k, corner in enumerate(step.face.corners):
-            corner.adjoints = _plus(corner.adjoints, samples.respond((k,)))
-        done = [step.exit.pick([corner.adjoints[i] for corner in step.face.corners]) for i in range(4)]
-        self._scatter(self.records.vertices, step.exit.vertex(step.face), done, True)
-        step.exit.carry_adjoints(step.face, step.next_face)
-        apex = samples.respond((_APEX,))
-        for mask, corner in zip(step.exit.dropped, step.next_face.corners, strict=True):
-            corner.adjoints = _select(mask, apex, corner.adjoints)
+        """Scatter the dropped corner; the others go on to the next face."""
+        old = _turned_rows(step.exit, [corner.adjoints for corner in step.face.corners])
+        dropped, *kept = (_plus(old[k], samples.respond(k)) for k in (_DROPPED, _AFTER, _BEFORE))
+        self._scatter(self.records.vertices, step.exit.vertex(step.face), dropped, True)
+        adjoints = _turned_back(step.exit, [samples.respond(_APEX), *kept])
+        for corner, response in zip(step.next_face.corners, adjoints, strict=True):
+            corner.adjoints = response
 
-    def _finish_edges(self, step: Step, ray: HatRay, samples: _Samples) -> tuple[list[Response], list[Any]]:
+    def _finish_edges(
+        self, exit_: Exit, ray: HatRay, samples: _Samples, cell: _RankedCell
+    ) -> tuple[list[Response], list[Any]]:
         """Scatter the three edges at the dropped corner; returns those of the next face."""
-        uint = self.view.backend.UInt
-        ranks, pick = _ranks(step), step.exit.pick
-        new_ids = [dr.gather(uint, self.tables.edges, _edge_row(step.cell, ranks[k], ranks[_APEX])) for k in range(3)]
-        old_ids, old = [], []
-        for k, (i, j) in enumerate(_FACE_EDGES):
-            unknown = ray.edge_ids[k] == _UNKNOWN
-            found = dr.gather(uint, self.tables.edges, _edge_row(step.cell, ranks[i], ranks[j]), unknown)
-            old_ids.append(dr.select(unknown, found, ray.edge_ids[k]))
-            old.append(_plus(ray.edges[k], samples.respond((i, j))))
-        new = [samples.respond((k, _APEX)) for k in range(3)]
-        self._scatter(self.records.edges, pick(new_ids), _pick(pick, new), True)
-        for turn in (1, 2):
-            ids, responses = ([values[(k + turn) % 3] for k in range(3)] for values in (old_ids, old))
-            self._scatter(self.records.edges, pick(ids), _pick(pick, responses), True)
-        edges, edge_ids = [], []
-        for k in range(3):
-            kept, after, before = step.exit.dropped[k], (k + 1) % 3, (k + 2) % 3
-            # Edge k of the next face is the old one if corner k went; else it joins the apex and the corner that stays.
-            other = _select(step.exit.dropped[after], new[before], new[after])
-            other_id = dr.select(step.exit.dropped[after], new_ids[before], new_ids[after])
-            edges.append(_select(kept, old[k], other))
-            edge_ids.append(dr.select(kept, old_ids[k], other_id))
-        return edges, edge_ids
+        rows = _turned_rows(exit_, [[known, *edge] for known, edge in zip(ray.edge_ids, ray.edges, strict=True)])
+        old = []
+        for row, corners in zip(rows, ((_AFTER, _BEFORE), (_BEFORE, _DROPPED), (_DROPPED, _AFTER)), strict=True):
+            unknown = row[0] == _UNKNOWN
+            edge = dr.select(unknown, cell.edge(*corners, unknown), row[0])
+            old.append([edge, *_plus(row[1:], samples.respond(*corners))])
+        new = [[cell.edge(k, _APEX), *samples.respond(k, _APEX)] for k in (_DROPPED, _AFTER, _BEFORE)]
+        for edge, *response in (new[_DROPPED], old[_AFTER], old[_BEFORE]):
+            self._scatter(self.records.edges, edge, response, True)
+        # The apex takes the dropped corner's place: opposite it lies what lay opposite that one.
+        kept = _turned_back(exit_, [old[_DROPPED], new[_BEFORE], new[_AFTER]])
+        return [row[1:] for row in kept], [row[0] for row in kept]
 
-    def _finish_faces(self, step: Step, ray: HatRay, samples: _Samples) -> Response:
+    def _finish_faces(self, ray: HatRay, samples: _Samples, cell: _RankedCell) -> Response:
         """Scatter the face entered through and the two passed by; returns the response of the face left through."""
-        uint, faces = self.view.backend.UInt, self.tables.faces
-        ranks, pick = _ranks(step), step.exit.pick
-        entered = _plus(ray.face, samples.respond((0, 1, 2)))
-        self._scatter(self.records.faces, dr.gather(uint, faces, 4 * step.cell + ranks[_APEX]), entered, True)
-        opposite = [samples.respond((*_FACE_EDGES[k], _APEX)) for k in range(3)]
-        for turn in (1, 2):
-            responses = [opposite[(k + turn) % 3] for k in range(3)]
-            row = 4 * step.cell + pick([ranks[(k + turn) % 3] for k in range(3)])
-            self._scatter(self.records.faces, dr.gather(uint, faces, row), _pick(pick, responses), True)
-        return _pick(pick, opposite)
+        entered = _plus(ray.face, samples.respond(_DROPPED, _AFTER, _BEFORE))
+        self._scatter(self.records.faces, cell.face(_APEX), entered, True)
+        for opposite, other in ((_BEFORE, _AFTER), (_AFTER, _BEFORE)):
+            self._scatter(self.records.faces, cell.face(opposite), samples.respond(_DROPPED, other, _APEX), True)
+        return samples.respond(_AFTER, _BEFORE, _APEX)
 
     def _scatter(self, buffer: Any, index: Any, response: Response, active: Any) -> None:
-        float4 = self.view.backend.Float4
         b, d, g = response[0], response[1:], self.gradient
         zero = dr.zeros_like(b)
         slope = dr.fma(g[0], d[0], dr.fma(g[1], d[1], g[2] * d[2]))
         square = dr.fma(d[0], d[0], dr.fma(d[1], d[1], d[2] * d[2]))
-        packets = [[g[0] * b, g[1] * b, g[2] * b, slope], [b * b, *(b * v for v in d)], [square, b, zero, zero]]
-        for k, packet in enumerate(packets):
-            dr.scatter_add(buffer, float4(*packet), 3 * index + k, active, mode=self.records.mode)
+        record = [g[0] * b, g[1] * b, g[2] * b, slope, b * b, *(b * v for v in d), square, b, zero, zero]
+        # In one piece: on GPUs, threads of a warp that share a record have to find each other but once.
+        dr.scatter_add(buffer, self.view.backend.Floats(record), index, active, mode=self.records.mode)
 
     def _no_response(self) -> Response:
         return [dr.zeros(self.view.backend.Float, dr.width(self.rays.pixel)) for _ in range(4)]
 
 
+@dataclass
+class _RankedCell:
+    """A cell, and the places of its corners among each other by the indices of their vertices."""
+
+    tables: HatTables
+    cell: Any
+    ranks: list[Any]
+
+    def edge(self, one: int, other: int, active: Any = True) -> Any:
+        """Index of the edge that joins two corners."""
+        first, second = self.ranks[one], self.ranks[other]
+        low, high = dr.select(first < second, first, second), dr.select(first < second, second, first)
+        row = 6 * self.cell + ((low * (7 - low)) >> 1) + (high - low - 1)  # in the order of LOCAL_EDGES
+        return dr.gather(type(self.cell), self.tables.edges, row, active)
+
+    def face(self, opposite: int) -> Any:
+        """Index of the face opposite a corner."""
+        return dr.gather(type(self.cell), self.tables.faces, 4 * self.cell + self.ranks[opposite])
+
+
 def _barycentric(step: Step) -> tuple[list[Any], list[Any]]:
-    """Coordinates in the cell, of the entry face's corners and the apex, where the ray enters and where it leaves."""
-    first, last = step.face.weights(), step.next_face.weights()
-    stays = [dr.select(mask, 0.0, w) for mask, w in zip(step.exit.dropped, last, strict=True)]
-    return [*first, dr.zeros_like(first[0])], [*stays, step.exit.pick(last)]
+    """Coordinates of the cell's corners where the ray enters and where it leaves."""
+    first, last = (_turned(step.exit, face.weights()) for face in (step.face, step.next_face))
+    zero = dr.zeros_like(first[0])
+    return [*first, zero], [zero, *last[1:], last[0]]
 
 
-def _ranks(step: Step) -> list[Any]:
-    """Place of each corner of the entry face, and of the apex, among the cell's four vertices by index."""
-    vertices = [*(corner.vertex for corner in step.face.corners), step.apex.vertex]
-    uint = type(step.cell)
+def _turned(exit_: Exit, items: list[Any]) -> list[Any]:
+    """Three corners' items, beginning with that of the dropped one."""
+    return [exit_.pick([items[(k + turn) % 3] for k in range(3)]) for turn in range(3)]
+
+
+def _turned_rows(exit_: Exit, rows: list[list[Any]]) -> list[list[Any]]:
+    columns = [_turned(exit_, list(column)) for column in zip(*rows, strict=True)]
+    return [list(row) for row in zip(*columns, strict=True)]
+
+
+def _turned_back(exit_: Exit, rows: list[list[Any]]) -> list[list[Any]]:
+    """The inverse of :func:`_turned_rows`."""
+    dropped = exit_.dropped
+    return [_select(dropped[k], rows[0], _select(dropped[(k + 2) % 3], rows[1], rows[2])) for k in range(3)]
+
+
+def _ranks(vertices: list[Any]) -> list[Any]:
+    """Place of each of a cell's vertices among all four by index."""
+    uint = type(vertices[0])
     ranks = []
     for vertex in vertices:
         rank = uint(0)
@@ -317,22 +339,12 @@ def _ranks(step: Step) -> list[Any]:
     return ranks
 
 
-def _edge_row(cell: Any, one: Any, other: Any) -> Any:
-    """Row of the edge table for two ranks, in the order of ``LOCAL_EDGES``."""
-    low, high = dr.select(one < other, one, other), dr.select(one < other, other, one)
-    return 6 * cell + ((low * (7 - low)) >> 1) + (high - low - 1)
-
-
 def _plus(one: Response, other: Response) -> Response:
     return [x + y for x, y in zip(one, other, strict=True)]
 
 
 def _select(mask: Any, one: Response, other: Response) -> Response:
     return [dr.select(mask, x, y) for x, y in zip(one, other, strict=True)]
-
-
-def _pick(pick: Any, responses: list[Response]) -> Response:
-    return [pick([response[i] for response in responses]) for i in range(4)]
 
 
 def _ranked_tables(topology: Topology, order: MemoryOrder) -> tuple[torch.Tensor, torch.Tensor]:
