@@ -12,7 +12,6 @@ from difftetvr.backend import Backend
 from difftetvr.mesh import TetMesh
 from difftetvr.recording import few_lengths, replayed
 from difftetvr.rendering.kernels.layout import (
-    EXTENT,
     CellSource,
     VertexSource,
     any_extent,
@@ -23,7 +22,7 @@ from difftetvr.rendering.search.camera_hits import CameraLanes, CameraSearch
 from difftetvr.rendering.search.entry import EntryCounts, EntryLists, count_entries, list_entries
 from difftetvr.rendering.search.memory_order import MemoryOrder, MeshTables
 from difftetvr.rendering.search.scene import Scene
-from difftetvr.rendering.search.starts import AROUND, CameraStarts
+from difftetvr.rendering.search.starts import AROUND, EXTENT, PointStarts
 from difftetvr.rendering.traversal.rays import ImageRays
 
 _SUMMARY = EXTENT + 4
@@ -72,7 +71,7 @@ class Extent:
 
     @staticmethod
     def of(numbers: Sequence[float]) -> Extent:
-        """From what kernels found, see :data:`difftetvr.rendering.kernels.layout.EXTENT`."""
+        """From what kernels found, see :data:`difftetvr.rendering.search.starts.EXTENT`."""
         low, high = (-numbers[1], -numbers[3], -numbers[5]), (numbers[0], numbers[2], numbers[4])
         return Extent(low, high, not numbers[EXTENT - 2] > 0)
 
@@ -122,7 +121,7 @@ def lay_out_for_camera(upload: Upload, rays: ImageRays, capacity: int = AROUND) 
     most, total, around = int(numbers[EXTENT]), int(numbers[-3]) << 16 | int(numbers[-2]), int(numbers[-1])
     if around > capacity:
         return lay_out_for_camera(upload, rays, few_lengths(around))
-    starts = CameraStarts(found.around, found.around_count, tables.adjacency, lanes.pixel)
+    starts = PointStarts(found.around, found.around_count, tables.adjacency, lanes.pixel)
     scene = upload.scene(found.records, rays)
     search = CameraSearch(scene, tables.boundary, lanes.worker, starts, tables.faces, lanes.workers)
     extent = Extent.of(numbers)

@@ -11,13 +11,11 @@ from typing import Any
 import drjit as dr
 
 from difftetvr.backend import Backend
+from difftetvr.rendering.search.starts import EXTENT
 from difftetvr.rendering.traversal.records import PACKET, Records, packets_of
 
 LARGEST = 1e6
 """Greatest coordinate that is laid out; anything beyond would overflow in products of float32."""
-
-EXTENT = 8
-"""Floats of an extent: greatest of x, -x, y, -y, z and -z; then 1 if something cannot be rendered; and one more."""
 
 
 @dataclass

@@ -9,15 +9,24 @@ from typing import Any
 import drjit as dr
 
 from difftetvr.backend import Backend
+from difftetvr.recording import replayed
 from difftetvr.rendering.search.hierarchy import CELLS_OF_A_LEAF, Hierarchy, SortedItems, sorted_cells
 from difftetvr.rendering.search.hits import Hit
 from difftetvr.rendering.search.memory_order import OrderedMesh
 from difftetvr.rendering.search.scene import Scene, boundary_half_faces
-from difftetvr.rendering.search.starts import NEAR, StartSearch
+from difftetvr.rendering.search.starts import (
+    NEAR,
+    PointStarts,
+    StartSearch,
+    find_cells_around,
+    for_each_start_among,
+    reach_of_beginnings,
+)
 from difftetvr.rendering.traversal.rays import Lanes
 from difftetvr.rendering.traversal.walk import crossing_depth, find_exit, holds_ray
 
 _FACES_OF_A_LEAF = 1
+_ONE_POINT = 64.0  # roundings by which the beginnings of rays may differ to count as one point
 
 
 @dataclass
@@ -29,8 +38,9 @@ class BundleSearch:
         lane: Numbers of all lanes.
         limits: Flat (N, 2) distances between which each ray is looked at; None for all of it.
         boundary: Over the half-faces of the boundary; None where entries are not asked for.
-        cells: Over all cells; None where no cells are looked for.
+        cells: Over all cells; None where no cells are looked for in it.
         adjacency: Flat (T, 4) cells behind the half-faces, where rays may start inside.
+        starts: The cells around the one point where all rays begin; None where there is none.
     """
 
     scene: Scene
@@ -39,6 +49,7 @@ class BundleSearch:
     boundary: Hierarchy | None
     cells: Hierarchy | None
     adjacency: Any | None
+    starts: PointStarts | None
 
     @staticmethod
     def for_entries(scene: Scene, mesh: OrderedMesh, limits: Any | None) -> BundleSearch:
@@ -56,15 +67,18 @@ class BundleSearch:
 
         items = topology.cached("hierarchy.boundary", build)
         boundary = Hierarchy.over(backend, items, mesh.positions, _FACES_OF_A_LEAF)
-        cells = None if limits is None else _over_cells(backend, mesh)
-        adjacency = None if limits is None else mesh.tables.adjacency
-        return BundleSearch(scene, backend.lanes(scene.rays.lane_count), limits, boundary, cells, adjacency)
+        lane = backend.lanes(scene.rays.lane_count)
+        if limits is None:
+            return BundleSearch(scene, lane, None, boundary, None, None, None)
+        starts = _starts_at_one_point(scene, lane, mesh, limits)
+        cells = _over_cells(backend, mesh) if starts is None else None
+        return BundleSearch(scene, lane, limits, boundary, cells, mesh.tables.adjacency, starts)
 
     @staticmethod
     def for_fragments(scene: Scene, mesh: OrderedMesh, limits: Any | None) -> BundleSearch:
         """What finds all cells that rays cross; the arguments are those of :meth:`for_entries`."""
         lane = scene.backend.lanes(scene.rays.lane_count)
-        return BundleSearch(scene, lane, limits, None, _over_cells(scene.backend, mesh), None)
+        return BundleSearch(scene, lane, limits, None, _over_cells(scene.backend, mesh), None, None)
 
     def for_each(self, visit: Callable[[Hit], None], settle: Callable[[], Any]) -> None:
         """Call ``visit`` for all half-faces that rays may enter through, or start behind.
@@ -128,8 +142,11 @@ class BundleSearch:
 
     def _for_each_start(self, visit: Callable[[Hit], None]) -> None:
         """Call ``visit`` for all cells in which rays may start."""
-        assert self.cells is not None
         rays, near, _ = self._lanes()
+        if self.starts is not None:
+            for_each_start_among(self.starts.search(self.scene, rays, near), self.starts, visit)
+            return
+        assert self.cells is not None
         search = StartSearch(self.scene, self.adjacency, rays, self.lane, near)
         frame = rays.frame
         assert frame.origin is not None
@@ -140,6 +157,18 @@ class BundleSearch:
             return state
 
         self.cells.meet_points(begin, NEAR, rays.valid, at_cell, self.lane)
+
+
+def _starts_at_one_point(scene: Scene, lane: Any, mesh: OrderedMesh, limits: Any) -> PointStarts | None:
+    """Cells around the point where all rays begin, which are found once for all of them; None if it is not one."""
+    reach = replayed(reach_of_beginnings, scene, lane, limits)
+    ends, extent = (array.numpy()[:6].astype(float) for array in (reach, mesh.extent))
+    spread, size = (ends[0::2] + ends[1::2]).max(), max(abs(ends).max(), abs(extent).max())
+    if not spread <= _ONE_POINT * float(dr.epsilon(scene.backend.Float)) * size:
+        return None
+    cell = scene.backend.lanes(mesh.order.topology.num_cells)
+    cells, count, _ = find_cells_around(scene, cell, mesh.extent, reach)
+    return PointStarts(cells, count, mesh.tables.adjacency, lane)
 
 
 def _over_cells(backend: Backend, mesh: OrderedMesh) -> Hierarchy:

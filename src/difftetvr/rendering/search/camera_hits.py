@@ -6,12 +6,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import drjit as dr
+
 from difftetvr.backend import Backend
 from difftetvr.rendering.search.hits import Hit
 from difftetvr.rendering.search.memory_order import MeshTables
 from difftetvr.rendering.search.rasterise import for_each_hit, work_items, workers_for
 from difftetvr.rendering.search.scene import Scene
-from difftetvr.rendering.search.starts import CameraStarts, cells_around_camera, for_each_start_at_camera
+from difftetvr.rendering.search.starts import PointStarts, cells_around, for_each_start_among
 from difftetvr.rendering.traversal.rays import ImageRays
 
 
@@ -58,15 +60,15 @@ class CameraSearch:
     scene: Scene
     half_faces: Any
     worker: Any
-    starts: CameraStarts
+    starts: PointStarts
     faces: int
     workers: int
 
     @staticmethod
     def of(scene: Scene, tables: MeshTables, lanes: CameraLanes, extent: Any) -> CameraSearch:
         """Search a scene in camera space of some extent."""
-        cells, count = cells_around_camera(scene, lanes.cell, extent, lanes.capacity)
-        starts = CameraStarts(cells, count, tables.adjacency, lanes.pixel)
+        cells, count = cells_around(scene, lanes.cell, extent, lanes.capacity, None)
+        starts = PointStarts(cells, count, tables.adjacency, lanes.pixel)
         return CameraSearch(scene, tables.boundary, lanes.worker, starts, tables.faces, lanes.workers)
 
     def for_each(self, visit: Callable[[Hit], None], settle: Callable[[], Any]) -> None:
@@ -76,7 +78,9 @@ class CameraSearch:
             visit: Takes a hit.
             settle: Called after each kernel's worth of hits.
         """
-        for_each_start_at_camera(self.scene, self.starts, visit)
+        lane = self.starts.lane
+        near = dr.zeros(self.scene.backend.Float, dr.width(lane))
+        for_each_start_among(self.starts.search(self.scene, self.scene.rays.of_lanes(lane), near), self.starts, visit)
         settle()
         for_each_hit(self.scene, work_items(self.scene, self.half_faces, self.worker), visit)
         settle()

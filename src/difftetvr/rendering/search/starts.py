@@ -18,11 +18,14 @@ from difftetvr.mesh.topology.topology import LOCAL_FACES
 from difftetvr.recording import few_lengths, replayed
 from difftetvr.rendering.search.hits import Hit
 from difftetvr.rendering.search.scene import Scene
-from difftetvr.rendering.traversal.rays import Lanes
+from difftetvr.rendering.traversal.rays import Lanes, rounding_of
 from difftetvr.rendering.traversal.walk import BOUNDARY, crossing_depth, find_exit
 
 AROUND = 1 << 10
 """Cells around a camera that there is room for at first: mostly there is one."""
+
+EXTENT = 8
+"""Floats of an extent: greatest of x, -x, y, -y, z and -z; then 1 if something cannot be rendered; and one more."""
 
 NEAR = 1e-4
 """Cells this near to an origin, relative to their size, are tried as the cell that holds it; each ray then decides."""
@@ -91,23 +94,21 @@ def _rounding(face: Any) -> Any:
     return 16.0 * dr.epsilon(size) * size
 
 
-def for_each_start_at_camera(scene: Scene, starts: CameraStarts, visit: Callable[[Hit], None]) -> None:
-    """Call ``visit`` for all cells in which rays of a camera may start."""
-    uint, lanes = scene.backend.UInt, dr.width(starts.lane)
-    rays = scene.rays.of_lanes(starts.lane)
-    search = StartSearch(scene, starts.adjacency, rays, starts.lane, dr.zeros(scene.backend.Float, lanes))
+def for_each_start_among(search: StartSearch, starts: PointStarts, visit: Callable[[Hit], None]) -> None:
+    """Call ``visit`` for all of some cells in which rays start."""
+    uint = search.scene.backend.UInt
     count = dr.gather(uint, starts.count, uint(0))
 
     def body(index: Any) -> tuple[Any]:
-        search.look_at(dr.gather(uint, starts.cells, index), rays.valid, visit)
+        search.look_at(dr.gather(uint, starts.cells, index), search.rays.valid, visit)
         return (index + 1,)
 
-    dr.while_loop((dr.zeros(uint, lanes),), lambda index: index < count, body)
+    dr.while_loop((dr.zeros(uint, dr.width(search.lane)),), lambda index: index < count, body)
 
 
 @dataclass
-class CameraStarts:
-    """Cells in which rays of a camera may start.
+class PointStarts:
+    """Cells in which rays that begin at one point may start.
 
     Attributes:
         cells: (capacity,) the cells around it, in any order.
@@ -121,37 +122,71 @@ class CameraStarts:
     adjacency: Any
     lane: Any
 
+    def search(self, scene: Scene, rays: Lanes, near: Any) -> StartSearch:
+        """What tells in which of them each ray starts."""
+        return StartSearch(scene, self.adjacency, rays, self.lane, near)
 
-def cells_around_camera(scene: Scene, cell: Any, extent: Any, capacity: int) -> tuple[Any, Any]:
-    """Cells that may hold the camera: it lies in them or very near.
+
+def reach_of_beginnings(scene: Scene, lane: Any, limits: Any) -> Any:
+    """Greatest of x, -x, y, -y, z and -z of the points from which on some rays are looked at, and two numbers more.
 
     Args:
-        scene: The cells, in the space of the camera.
+        scene: The rays; they have origins.
+        lane: Numbers of all lanes.
+        limits: Flat (N, 2) distances between which each ray is looked at.
+    """
+    backend, rays = scene.backend, scene.rays.of_lanes(lane)
+    assert rays.frame.origin is not None
+    near = dr.gather(backend.Float2, limits, rays.pixel, rays.valid)[0]
+    reach = dr.full(backend.Float, -dr.inf, EXTENT)
+    mode = dr.ReduceMode.Expand if backend.name == "llvm" else dr.ReduceMode.Auto
+    for axis, (d, o) in enumerate(zip(rays.frame.direction, rays.frame.origin, strict=True)):
+        begin = dr.fma(near, d, o)
+        # Where a ray begins nowhere, there is no one point.
+        begin = dr.select(dr.isfinite(begin), begin, dr.inf)
+        for side, end in enumerate((begin, -begin)):
+            place = backend.UInt(2 * axis + side)
+            dr.scatter_reduce(dr.ReduceOp.Max, reach, dr.select(rays.valid, end, -dr.inf), place, mode=mode)
+    dr.eval(reach)
+    return reach
+
+
+def cells_around(scene: Scene, cell: Any, extent: Any, capacity: int, reach: Any | None) -> tuple[Any, Any]:
+    """Cells that may hold the point where rays begin: it lies in them or very near.
+
+    Args:
+        scene: The cells.
         cell: (T,) their numbers.
         extent: Greatest of x, -x, y, -y, z and -z of any vertex: most cameras look at the mesh from outside.
         capacity: How many cells there is room for.
+        reach: Of the point, likewise, as far as rounding lets it; None for the origin, where a camera is.
 
     Returns:
         (capacity,) the cells, in any order, and (1,) their number.
     """
     backend, uint, real = scene.backend, scene.backend.UInt, scene.backend.Float
-    around = backend.Bool(True)
+    ends = [real(0) if reach is None else dr.gather(real, reach, uint(k)) for k in range(6)]
+    around, blur = backend.Bool(True), real(0)
     for k in range(6):
-        around &= dr.gather(real, extent, uint(k)) >= 0
+        farthest = dr.gather(real, extent, uint(k))
+        around &= farthest >= -ends[k ^ 1]
+        if reach is not None:
+            blur = dr.fmax(blur, dr.fmax(rounding_of(dr.abs(farthest)), ends[k] + ends[k ^ 1]))
     corners = scene.cell(cell, around)
-    points = [scene.point(corners[k], around) for k in range(4)]
+    center = [0.5 * (ends[2 * axis] - ends[2 * axis + 1]) for axis in range(3)]
+    points = [[x - c for x, c in zip(scene.point(corners[k], around), center, strict=True)] for k in range(4)]
     size, lows, highs = real(0), [], []
     for axis in range(3):
         values = [point[axis] for point in points]
         lows.append(dr.fmin(dr.fmin(values[0], values[1]), dr.fmin(values[2], values[3])))
         highs.append(dr.fmax(dr.fmax(values[0], values[1]), dr.fmax(values[2], values[3])))
         size = dr.fmax(size, highs[axis] - lows[axis])
-    margin = NEAR * size
+    margin = dr.fma(NEAR, size, blur)
     for low, high in zip(lows, highs, strict=True):
         around &= (low <= margin) & (high >= -margin)
-    # The camera is the origin: with an outward face of a cell around it, it spans a positive volume.
+    # With an outward face of a cell around it, the point spans a positive volume.
     for i, j, k in LOCAL_FACES:
-        around &= _triple(points[i], points[j], points[k]) >= -NEAR * size * size * size
+        around &= _triple(points[i], points[j], points[k]) >= -margin * size * size
     found, used = dr.empty(uint, capacity), dr.zeros(uint, 1)
     place: Any = dr.scatter_inc(used, uint(0), around)
     dr.scatter(found, cell, place, around & (place < capacity))
@@ -159,11 +194,15 @@ def cells_around_camera(scene: Scene, cell: Any, extent: Any, capacity: int) -> 
     return found, used
 
 
-def find_cells_around(scene: Scene, cell: Any, extent: Any, capacity: int = AROUND) -> tuple[Any, int]:
-    """All cells that may hold the camera, and their number; arguments as in :func:`cells_around_camera`."""
-    cells, used = replayed(cells_around_camera, scene, cell, extent, capacity)
+def find_cells_around(
+    scene: Scene, cell: Any, extent: Any, reach: Any | None = None, capacity: int = AROUND
+) -> tuple[Any, Any, int]:
+    """All cells that may hold a point, their number, and the same on the host; see :func:`cells_around`."""
+    cells, used = replayed(cells_around, scene, cell, extent, capacity, reach)
     count = int(used[0])
-    return (cells, count) if count <= int(capacity) else find_cells_around(scene, cell, extent, few_lengths(count))
+    if count > capacity:
+        return find_cells_around(scene, cell, extent, reach, few_lengths(count))
+    return cells, used, count
 
 
 def _triple(p: list[Any], q: list[Any], r: list[Any]) -> Any:

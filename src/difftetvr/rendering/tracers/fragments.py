@@ -55,7 +55,7 @@ class FragmentRaster:
             self.bundle = BundleSearch.for_fragments(self.scene, aim.ordered, aim.view.limits)
             return
         cells = backend.lanes(self.half_faces // 4)
-        self.around, self.around_count = find_cells_around(self.scene, cells, aim.ordered.extent)
+        self.around, _, self.around_count = find_cells_around(self.scene, cells, aim.ordered.extent)
 
     @property
     def starts_inside(self) -> bool:
