@@ -10,9 +10,11 @@ import torch
 from torch.autograd.function import once_differentiable
 
 from difftetvr.backend import Backend
+from difftetvr.memory import tried_twice
 from difftetvr.mesh import TetMesh
 from difftetvr.optics import OpticalModel
 from difftetvr.rendering.cameras.pinhole import Camera
+from difftetvr.rendering.flags import flags_here, with_flags
 from difftetvr.rendering.kernels.adjoint import ImageAdjoint, Wanted, render_adjoint
 from difftetvr.rendering.kernels.forward import render_forward
 from difftetvr.rendering.tracers.linked_list import LinkedList
@@ -128,19 +130,20 @@ class RenderFunction(torch.autograd.Function):
             light, distance = render_forward(tracer)
             image = task.backend.tensor(light, -1, tracer.view.records.width), task.backend.tensor(distance)
         ctx.set_materialize_grads(False)
-        ctx.task, ctx.tracer = task, tracer
+        ctx.task, ctx.tracer, ctx.flags = task, tracer, flags_here()
         ctx.vertex_count, ctx.part_size = vertices.shape[0], parts[0].shape[0]
         ctx.save_for_backward(*image)
         return image
 
     @staticmethod
     @once_differentiable
+    @tried_twice
     def backward(ctx: Any, g_light: Any, g_distance: Any) -> Any:
         """Go through the crossings again with the image's derivatives."""
         backend = ctx.task.backend
         light, distance = ctx.saved_tensors
         wanted = Wanted(*ctx.needs_input_grad[1:4])
-        with backend.exclusive(one_thread=ctx.task.deterministic):
+        with with_flags(ctx.flags), backend.exclusive(one_thread=ctx.task.deterministic):
             image = ImageAdjoint(
                 backend.floats(torch.zeros_like(light) if g_light is None else g_light),
                 None if g_distance is None else backend.floats(g_distance),

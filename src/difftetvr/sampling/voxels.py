@@ -10,6 +10,7 @@ import torch
 
 from difftetvr.errors import MeshError, shown
 from difftetvr.inputs import as_number, as_reals, as_whole
+from difftetvr.memory import tried_twice
 from difftetvr.mesh import TetMesh
 from difftetvr.mesh.field import Location
 from difftetvr.sampling.location import Lattice, locate_lattice
@@ -19,6 +20,7 @@ MOST_VOXELS = 1 << 31
 _AT_ONCE = 1 << 22  # points whose values are interpolated at a time
 
 
+@tried_twice
 def voxelise(
     mesh: TetMesh,
     values: torch.Tensor,
