@@ -16,6 +16,7 @@ SOURCES = sorted(PACKAGE.rglob("*.py"))
 
 GROUND = {
     *("_lazy", "_version", "archive", "declared", "errors", "files", "inputs", "interrupts", "libcuda", "libllvm"),
+    "memory",
     "srgb",
     "trust",
     "vtk_xml",

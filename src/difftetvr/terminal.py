@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import io
 import os
 import re
@@ -18,6 +17,7 @@ from rich.segment import Segment
 from rich.text import Text
 
 from difftetvr.errors import DiffTetError
+from difftetvr.memory import is_out_of_memory
 
 _LONG_SECONDS = 3.0
 _NARROWEST, _WIDEST, _LOWEST = 20, 500, 5
@@ -25,12 +25,6 @@ _NARROWEST, _WIDEST, _LOWEST = 20, 500, 5
 _CONTROLS = re.compile(r"[\x00-\x09\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 _ENDLESS = re.compile(r"(\S{100})\S{800,}(\S{100})")
 _NO_MEMORY = "There is not enough memory; use fewer cells, or fewer or smaller views."
-# Torch's and Dr.Jit's allocators raise RuntimeErrors like any others; only their words tell them apart.
-_ALLOCATION = re.compile(
-    r"DefaultCPUAllocator|(?:can't|cannot|could not|unable to|failed to) allocate|out[ _]of[ _]memory|not enough memory"
-    r"|bad[_ ]alloc",
-    re.IGNORECASE,
-)
 
 
 class _Listener:
@@ -183,16 +177,6 @@ def sentence_for(error: Exception) -> str | None:
     if isinstance(error, OSError):
         return _one_line(f"{error.strerror or error}{f': {error.filename}' if error.filename else ''}.")
     return None
-
-
-def is_out_of_memory(error: BaseException) -> bool:
-    """Whether an error of Python, NumPy, PyTorch or Dr.Jit means that memory is short."""
-    torch = sys.modules.get("torch")  # only what has been imported can have raised
-    if isinstance(error, MemoryError) or (torch is not None and isinstance(error, torch.OutOfMemoryError)):
-        return True
-    if isinstance(error, OSError):
-        return error.errno == errno.ENOMEM
-    return isinstance(error, RuntimeError) and _ALLOCATION.search(str(error)) is not None
 
 
 def _one_line(text: str) -> str:

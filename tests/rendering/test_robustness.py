@@ -9,7 +9,8 @@ import torch
 from difftetvr.backend import dr
 from difftetvr.errors import CameraError, DiffTetError, MeshError
 from difftetvr.mesh import Field, TetMesh
-from difftetvr.rendering import Camera, Rays, render
+from difftetvr.rendering import Camera, Rays, autograd, render
+from difftetvr.rendering.kernels.adjoint import render_adjoint
 
 
 def scene(unit: float = 1.0, dtype: torch.dtype = torch.float32) -> tuple[TetMesh, Field, Camera]:
@@ -55,6 +56,26 @@ def test_another_thread_may_go_backward_time_and_again() -> None:
             loss = render(mesh, Field(field.color, density), rays).color.sum()
             other.submit(loss.backward).result()
             assert density.grad is not None and float(density.grad.abs().sum()) > 0
+
+
+def test_flags_of_the_caller_hold_in_the_thread_that_goes_backward(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Dr.Jit has them for each thread, and autograd one of its own for each GPU."""
+    mesh, field, camera = scene()
+    density = field.density.clone().requires_grad_()
+    held = []
+
+    def recorded(*args):
+        held.append(dr.flag(dr.JitFlag.KernelHistory))
+        return render_adjoint(*args)
+
+    monkeypatch.setattr(autograd, "render_adjoint", recorded)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        loss = render(mesh, Field(field.color, density), camera).color.sum()
+        dr.kernel_history()  # empties it
+    with ThreadPoolExecutor(1) as other:
+        other.submit(loss.backward).result()
+        assert held == [True] and not other.submit(dr.flag, dr.JitFlag.KernelHistory).result()
+    assert density.grad is not None
 
 
 @pytest.mark.parametrize("unit", [1e-20, 1e-17, 1e-9, 1e9, 1e19])

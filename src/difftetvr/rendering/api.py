@@ -12,6 +12,7 @@ import torch
 from difftetvr.backend import eager
 from difftetvr.errors import DiffTetError, shown
 from difftetvr.inputs import as_reals
+from difftetvr.memory import tried_twice
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.optics import OpticalModel
 from difftetvr.rendering.autograd import RenderFunction
@@ -94,6 +95,7 @@ def render(
 
 
 @eager
+@tried_twice
 def render(
     mesh: TetMesh,
     field: Field | ScalarField | CellFeatures,

@@ -8,7 +8,9 @@ from typing import Any
 import torch
 from torch.autograd.function import once_differentiable
 
+from difftetvr.memory import tried_twice
 from difftetvr.recording import few_lengths, replayed
+from difftetvr.rendering.flags import flags_here, with_flags
 from difftetvr.rendering.kernels.adjoint import ImageAdjoint, render_adjoint
 from difftetvr.rendering.kernels.composition import Composition, Pixels
 from difftetvr.rendering.kernels.forward import render_forward
@@ -42,6 +44,7 @@ class RenderFunction(torch.autograd.Function):
             pixels = channels, *(backend.tensor(part) for part in (image.alpha, image.depth, image.optical_depth))
         ctx.set_materialize_grads(False)
         ctx.task, ctx.shot, ctx.how, ctx.gathered = task, shot, how, (rendered.light, rendered.distance)
+        ctx.flags = flags_here(backend)
         needs_pose, needs_background = ctx.needs_input_grad[3:5]
         ctx.save_for_backward(
             vertices if needs_pose else None, pose, pixels[3] if needs_background and task.channels else None
@@ -50,6 +53,7 @@ class RenderFunction(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
+    @tried_twice
     def backward(ctx: Any, *by_image: Any) -> Any:
         """Go through the crossings again with the image's derivatives."""
         task, backend, shot = ctx.task, ctx.task.backend, ctx.shot
@@ -57,7 +61,7 @@ class RenderFunction(torch.autograd.Function):
         needs_vertices, needs_pose, needs_background, needs_limits, needs_lines = ctx.needs_input_grad[2:7]
         wanted = Wanted(needs_vertices or needs_pose, needs_limits, needs_lines)
         derivatives = [None if part is None or not part.numel() else backend.floats(part) for part in by_image]
-        with backend.exclusive(one_thread=task.deterministic):
+        with with_flags(ctx.flags), backend.exclusive(one_thread=task.deterministic):
             image = ImageAdjoint(Pixels(*derivatives), ctx.how, *ctx.gathered)
             gradients = render_adjoint(shot.tracer, image, task.mesh.num_vertices, wanted)
             geometry, parts = gradient_tensors(task, gradients, pose, vertices)

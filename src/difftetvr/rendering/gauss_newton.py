@@ -9,6 +9,7 @@ import torch
 from difftetvr.backend import eager
 from difftetvr.errors import DiffTetError, MeshError, shown
 from difftetvr.inputs import as_reals, require_type
+from difftetvr.memory import tried_twice
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.rendering.api import as_background
 from difftetvr.rendering.kernels.composition import Composition
@@ -143,6 +144,7 @@ class ImageModel:
 
 
 @eager
+@tried_twice
 @torch.no_grad()
 def model_image(
     mesh: TetMesh,

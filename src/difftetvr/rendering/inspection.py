@@ -13,6 +13,7 @@ import torch
 from difftetvr.backend import eager, require_own_threads
 from difftetvr.errors import DiffTetError
 from difftetvr.inputs import require_type
+from difftetvr.memory import tried_twice
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.rendering.preparation import ViewOptions, prepare_view
 from difftetvr.rendering.rays import Rays, RaySource
@@ -35,6 +36,7 @@ class RayStatistics:
 
 
 @eager
+@tried_twice
 @torch.no_grad()
 def inspect_rays(
     mesh: TetMesh,

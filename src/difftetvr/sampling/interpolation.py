@@ -13,7 +13,9 @@ import torch
 from torch.autograd.function import once_differentiable
 
 from difftetvr.backend import Backend, backend_for
+from difftetvr.memory import tried_twice
 from difftetvr.mesh import TetMesh
+from difftetvr.rendering.flags import flags_here, with_flags
 from difftetvr.sampling.location import NOWHERE, CellReader, cross, dot
 
 
@@ -28,9 +30,9 @@ class Interpolate(torch.autograd.Function):
         ctx: Any, mesh: TetMesh, vertices: torch.Tensor, values: torch.Tensor, points: torch.Tensor, cells: torch.Tensor
     ) -> torch.Tensor:
         """Interpolate."""
-        ctx.mesh = mesh
-        ctx.save_for_backward(vertices, values, points, cells)
         backend, channels = backend_for(vertices), values.shape[1]
+        ctx.mesh, ctx.flags = mesh, flags_here(backend)
+        ctx.save_for_backward(vertices, values, points, cells)
         if not points.shape[0]:
             return values.new_empty((0, channels))
         with backend.exclusive():
@@ -47,6 +49,7 @@ class Interpolate(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
+    @tried_twice
     def backward(ctx: Any, gradient: torch.Tensor) -> Any:
         """Derivatives by vertices, values and points."""
         vertices, values, points, cells = ctx.saved_tensors
@@ -56,7 +59,7 @@ class Interpolate(torch.autograd.Function):
         likes = (vertices, values, points)
         if not points.shape[0]:
             return None, *(torch.zeros_like(t) if w else None for t, w in zip(likes, wanted, strict=True)), None
-        with backend.exclusive():
+        with with_flags(ctx.flags), backend.exclusive():
             place = _Place.of(backend, ctx.mesh, vertices, points, cells)
             weights, slopes = place.weights()
             table, worth = backend.floats(values), backend.floats(gradient)

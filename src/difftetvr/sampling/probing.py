@@ -9,12 +9,14 @@ import torch
 
 from difftetvr.errors import MeshError, shown
 from difftetvr.inputs import as_number, as_reals, require_type
+from difftetvr.memory import tried_twice
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.mesh.field import Location, location_of, require_location
 from difftetvr.sampling.interpolation import Interpolate
 from difftetvr.sampling.location import locate
 
 
+@tried_twice
 def probe(
     mesh: TetMesh,
     values: torch.Tensor,

@@ -8,6 +8,7 @@ import torch
 
 from difftetvr.errors import MeshError
 from difftetvr.inputs import as_number, as_reals, as_whole
+from difftetvr.memory import tried_twice
 from difftetvr.mesh import TetMesh
 from difftetvr.mesh.field import Location
 from difftetvr.sampling.grids import checked_lattice
@@ -19,6 +20,7 @@ AT_ONCE = 1 << 22
 """Points whose values are interpolated at a time."""
 
 
+@tried_twice
 def voxelise(
     mesh: TetMesh,
     values: torch.Tensor,

@@ -14,6 +14,7 @@ from difftetvr.backend import Backend, default_device, get_backend
 from difftetvr.capture.volumes.volume import Volume
 from difftetvr.capture.volumes.volume_kernel import VolumeTables, enter_box, march
 from difftetvr.errors import CaptureError, shown
+from difftetvr.memory import tried_twice
 from difftetvr.optics.transfer_function import TransferFunction
 from difftetvr.rendering.cameras.pinhole import Camera
 
@@ -94,6 +95,7 @@ class VolumeRenderer:
         images = images.reshape(len(cameras), height, width, 4)
         return images[..., :3].contiguous(), images[..., 3].contiguous()
 
+    @tried_twice
     def _launch(self, cameras: Sequence[Camera], order: np.ndarray) -> torch.Tensor:
         """(N, H * W, 4) premultiplied colour and alpha of some views, on the CPU."""
         b = self._backend

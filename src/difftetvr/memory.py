@@ -1,0 +1,71 @@
+"""When memory is short: how it shows, and one more try with what allocators have kept for themselves.
+
+PyTorch and Dr.Jit both keep the memory of a GPU that is freed, to hand it out again, and neither can take what the
+other keeps. So one of them may find a card full of memory that nobody uses.
+"""
+
+from __future__ import annotations
+
+import errno
+import functools
+import re
+import sys
+from collections.abc import Callable
+from typing import ParamSpec, TypeVar
+
+Parameters = ParamSpec("Parameters")
+Result = TypeVar("Result")
+
+# Torch's and Dr.Jit's allocators raise RuntimeErrors like any others; only their words tell them apart.
+_ALLOCATION = re.compile(
+    r"DefaultCPUAllocator|(?:can't|cannot|could not|unable to|failed to) allocate|out[ _]of[ _]memory|not enough memory"
+    r"|bad[_ ]alloc",
+    re.IGNORECASE,
+)
+
+
+def is_out_of_memory(error: BaseException | None) -> bool:
+    """Whether an error of Python, NumPy, PyTorch or Dr.Jit means that memory is short, by itself or by its cause."""
+    torch = sys.modules.get("torch")  # only what has been imported can have raised
+    while error is not None:
+        if isinstance(error, MemoryError) or (torch is not None and isinstance(error, torch.OutOfMemoryError)):
+            return True
+        if isinstance(error, OSError) and error.errno == errno.ENOMEM:
+            return True
+        if isinstance(error, RuntimeError) and _ALLOCATION.search(str(error)):
+            return True
+        error = error.__cause__  # Dr.Jit's loops hide what went wrong in them behind an error of their own
+    return False
+
+
+def tried_twice(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """A function that is called once more if a GPU's memory does not suffice, behind :func:`give_back`.
+
+    It must not have changed anything that its second call sees.
+    """
+
+    @functools.wraps(function)
+    def call(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
+        try:
+            return function(*args, **kwargs)
+        except Exception as error:
+            if not (_is_on_a_gpu() and is_out_of_memory(error)):
+                raise
+        give_back()  # only here, where nothing of the first call lives any longer
+        return function(*args, **kwargs)
+
+    return call
+
+
+def give_back() -> None:
+    """Have PyTorch and Dr.Jit return the memory of GPUs that they keep and nobody uses; both must be in use."""
+    torch, drjit = sys.modules["torch"], sys.modules["drjit"]
+    drjit.sync_thread()
+    drjit.flush_malloc_cache()
+    torch.cuda.synchronize()  # what Dr.Jit has freed is free once its stream has come so far
+    torch.cuda.empty_cache()
+
+
+def _is_on_a_gpu() -> bool:
+    torch = sys.modules.get("torch")
+    return torch is not None and "drjit" in sys.modules and torch.cuda.is_initialized()
