@@ -165,7 +165,7 @@ def _lay_out_and_count(
     # One array, for one wait; halves, for floats do not hold all integers.
     summary, total = dr.empty(backend.Float, _SUMMARY), counts.total
     dr.scatter(summary, extent, dr.arange(backend.UInt, EXTENT))
-    for place, number in enumerate((counts.most, total >> 16, total & 0xFFFF, search.starts.count)):
-        dr.scatter(summary, backend.Float(number), backend.UInt(EXTENT + place))
+    numbers = (counts.most, total >> 16, total & 0xFFFF, search.starts.count)
+    dr.scatter(summary, backend.Floats([backend.Float(number) for number in numbers]), backend.UInt(EXTENT // 4))
     dr.eval(summary)
     return _Found(records, cell_records, extent, search.starts.cells, search.starts.count, counts, summary)

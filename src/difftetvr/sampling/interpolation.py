@@ -39,12 +39,15 @@ class Interpolate(torch.autograd.Function):
             place = _Place.of(backend, mesh, vertices, points, cells)
             weights, _ = place.weights()
             table, found = backend.floats(values), dr.empty(backend.Float, channels * points.shape[0])
+            totals = []
             for channel in range(channels):
                 total = backend.Float(0)
                 for weight, vertex in zip(weights, place.tet, strict=True):
                     value = dr.gather(backend.Float, table, channels * vertex + channel, place.known)
                     total = dr.fma(weight, value, total)
-                dr.scatter(found, dr.select(place.known, total, 0.0), channels * place.lane + channel)
+                totals.append(dr.select(place.known, total, 0.0))
+            if totals:
+                dr.scatter(found, backend.Floats(totals), place.lane)
             return backend.tensor(found, points.shape[0], channels)
 
     @staticmethod
@@ -75,9 +78,10 @@ class Interpolate(torch.autograd.Function):
                     if needs_values:
                         dr.scatter_add(of_values, g * weights[k], index, place.known)
             slope = [dot(corner_worth, [row[axis] for row in slopes]) for axis in range(3)]
+            if needs_points:
+                known = [dr.select(place.known, part, 0.0) for part in slope]
+                dr.scatter(of_points, backend.Floats(known), place.lane)
             for axis in range(3):
-                if needs_points:
-                    dr.scatter(of_points, dr.select(place.known, slope[axis], 0.0), 3 * place.lane + axis)
                 if needs_vertices:
                     for weight, vertex in zip(weights, place.tet, strict=True):
                         dr.scatter_add(of_vertices, -weight * slope[axis], 3 * vertex + axis, place.known)

@@ -7,6 +7,8 @@ from typing import Any
 
 import drjit as dr
 
+from difftetvr.backend import Backend
+
 _THIN = 1.0  # optical depth up to which one minus the transmittance would lose digits
 
 
@@ -59,15 +61,17 @@ class Pixels:
         return Pixels(*(dr.empty(real, size) for size in (max(channels, 1) * count, count, count, count)))
 
     def write(
-        self, how: Composition, channels: list[Any], distance: Any, optical_depth: Any, pixel: Any, valid: Any
+        self, backend: Backend, how: Composition, gathered: tuple[list[Any], Any, Any], pixel: Any, valid: Any
     ) -> None:
-        """Store what some rays have gathered."""
-        real, count = type(distance), len(channels)
+        """Store what some rays have gathered: channels, integral of the distance and optical depth."""
+        channels, distance, optical_depth = gathered
+        real = backend.Float
         alpha, transmittance = opacity(optical_depth), dr.exp(-optical_depth)
-        for k, channel in enumerate(channels):
-            if how.background is not None:
-                channel = dr.fma(transmittance, dr.gather(real, how.background, type(pixel)(k)), channel)
-            dr.scatter(self.color, channel, count * pixel + k, valid)
+        if how.background is not None:
+            behind = (dr.gather(real, how.background, type(pixel)(k)) for k in range(len(channels)))
+            channels = [dr.fma(transmittance, b, c) for b, c in zip(behind, channels, strict=True)]
+        if channels:
+            dr.scatter(self.color, backend.Floats(channels), pixel, valid)
         shift = real(0) if how.shift is None else dr.gather(real, how.shift, pixel, valid)
         dr.scatter(self.alpha, alpha, pixel, valid)
         dr.scatter(self.depth, expected_distance(distance, alpha, shift, how.unit), pixel, valid)

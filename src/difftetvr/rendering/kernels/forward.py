@@ -135,7 +135,8 @@ class _ForwardKernel(SegmentKernel):
         view, pixel, valid, rendered = self.view, self.rays.pixel, self.rays.valid, self.rendered
         view.records.scatter(view.backend, rendered.light, [*ray.channels, ray.optical_depth], pixel, valid)
         dr.scatter(rendered.distance, ray.distance, pixel, valid)
-        rendered.image.write(self.how, ray.channels, ray.distance, ray.optical_depth, pixel, valid)
+        gathered = ray.channels, ray.distance, ray.optical_depth
+        rendered.image.write(view.backend, self.how, gathered, pixel, valid)
 
 
 def _distribute(face: Face, weight: Any) -> None:

@@ -95,8 +95,7 @@ def lay_out_vertices(source: VertexSource, length: int) -> tuple[Any, Any]:
     values[:3] = [dr.select(dr.abs(coordinate) <= LARGEST, coordinate, 0) for coordinate in position]
     values += [real(0)] * (PACKET * stride - len(values))
     records, place = dr.empty(real, PACKET * stride * length), dr.arange(uint, dr.width(vertex))
-    for k in range(stride):
-        dr.scatter(records, source.backend.Float4(*values[PACKET * k : PACKET * (k + 1)]), stride * place + k)
+    dr.scatter(records, source.backend.Floats(values), place)
     dr.eval(records, extent)
     return records, extent
 
@@ -166,13 +165,12 @@ def collect(source: GradientSource, length: int) -> tuple[Any | None, Any | None
                 dr.fma(rows[0][k], vector[0], dr.fma(rows[1][k], vector[1], rows[2][k] * vector[2])) for k in range(3)
             ]
         positions = dr.empty(real, 3 * length)
-        for k, component in enumerate(vector):
-            dr.scatter(positions, component, 3 * order + k)
+        dr.scatter(positions, backend.Floats(vector), order)
     if source.records is not None:
         *by_channel, by_value = Records(source.channels).gather(backend, source.records, place)
         channels, values = dr.empty(real, max(source.channels, 1) * length), dr.empty(real, length)
-        for k, component in enumerate(by_channel):
-            dr.scatter(channels, component, source.channels * order + k)
+        if by_channel:
+            dr.scatter(channels, backend.Floats(by_channel), order)
         dr.scatter(values, by_value, order)
     dr.eval(positions, channels, values)
     return positions, channels, values

@@ -210,9 +210,7 @@ class WalkAdjoint:
         if self.gradients.lines is not None:
             moved, turned = self.rays.frame.unproject(*ray.line[:3]), (*ray.line[3:], ray.line[0] * 0.0)
             values = [*moved, *self.rays.frame.unproject(*turned)]
-            for k in range(3):
-                packet = self.view.backend.Float2(*values[2 * k : 2 * k + 2])
-                dr.scatter(self.gradients.lines, packet, 3 * self.rays.pixel + k, self.rays.valid)
+            dr.scatter(self.gradients.lines, self.view.backend.Floats(values), self.rays.pixel, self.rays.valid)
 
     def _distribute(self, face: Face, crossing: list[Any], line: list[Any]) -> list[Any]:
         """Add a crossing's derivatives to the accumulators of its face's corners; returns those of the ray."""

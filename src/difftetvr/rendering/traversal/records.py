@@ -41,22 +41,19 @@ class Records:
 
     def scatter(self, backend: Backend, array: Any, values: list[Any], index: Any, active: Any = True) -> None:
         """Store a record."""
-        for part, place in self._parts(backend, values, index):
-            dr.scatter(array, part, place, active)
+        dr.scatter(array, self._whole(backend, values), index, active)
 
     def scatter_add(
         self, backend: Backend, array: Any, values: list[Any], index: Any, active: Any, mode: dr.ReduceMode
     ) -> None:
         """Add to a record."""
-        for part, place in self._parts(backend, values, index):
-            dr.scatter_add(array, part, place, active, mode=mode)
+        dr.scatter_add(array, self._whole(backend, values), index, active, mode=mode)
 
-    def _parts(self, backend: Backend, values: list[Any], index: Any) -> list[tuple[Any, Any]]:
+    def _whole(self, backend: Backend, values: list[Any]) -> Any:
+        # In one piece: several scatters to one array are kernels of their own, each of which computes everything.
         if not self.channels:
-            return [(values[0], index)]
-        count = packets_of(self.channels + 1)
-        padded = values + [backend.Float(0)] * (PACKET * count - len(values))
-        return [(backend.Float4(*padded[PACKET * k : PACKET * (k + 1)]), index * count + k) for k in range(count)]
+            return values[0]
+        return backend.Floats(values + [backend.Float(0)] * (self.width - len(values)))
 
     def pack(self, channels: torch.Tensor, last: torch.Tensor) -> torch.Tensor:
         """(N, width) records from (N, C) channels and (N,) values."""
