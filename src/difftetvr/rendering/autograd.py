@@ -44,7 +44,7 @@ class RenderFunction(torch.autograd.Function):
             pixels = channels, *(backend.tensor(part) for part in (image.alpha, image.depth, image.optical_depth))
         ctx.set_materialize_grads(False)
         ctx.task, ctx.shot, ctx.how, ctx.gathered = task, shot, how, (rendered.light, rendered.distance)
-        ctx.flags = flags_here(backend)
+        ctx.flags = flags_here()
         needs_pose, needs_background = ctx.needs_input_grad[3:5]
         ctx.save_for_backward(
             vertices if needs_pose else None, pose, pixels[3] if needs_background and task.channels else None

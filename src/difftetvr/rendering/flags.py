@@ -11,27 +11,20 @@ from contextlib import ExitStack, contextmanager
 
 import drjit as dr
 
-from difftetvr.backend import Backend
-
 _OF_DRJIT_ITSELF = (dr.JitFlag.SymbolicScope, dr.JitFlag.FreezingScope, dr.JitFlag.Default)  # where it is, or several
 _FLAGS = tuple(flag for flag in dr.JitFlag if flag not in _OF_DRJIT_ITSELF)
 
 
-def flags_here(backend: Backend) -> tuple[bool, ...] | None:
-    """This thread's flags; None on a back end whose backward passes run in the thread that asks for them."""
-    return None if backend.name == "llvm" else _flags()
-
-
-def _flags() -> tuple[bool, ...]:
-    return tuple(dr.flag(flag) for flag in _FLAGS)
+def flags_here() -> tuple[bool, ...]:
+    """This thread's flags."""
+    return tuple([dr.flag(flag) for flag in _FLAGS])
 
 
 @contextmanager
-def with_flags(flags: tuple[bool, ...] | None) -> Iterator[None]:
+def with_flags(flags: tuple[bool, ...]) -> Iterator[None]:
     """Let flags of another thread hold in this one."""
     with ExitStack() as stack:
-        if flags is not None:
-            for flag, is_set, is_set_here in zip(_FLAGS, flags, _flags(), strict=True):
-                if is_set != is_set_here:
-                    stack.enter_context(dr.scoped_set_flag(flag, is_set))
+        for flag, is_set, is_set_here in zip(_FLAGS, flags, flags_here(), strict=True):
+            if is_set != is_set_here:
+                stack.enter_context(dr.scoped_set_flag(flag, is_set))
         yield

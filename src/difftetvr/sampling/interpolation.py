@@ -31,7 +31,7 @@ class Interpolate(torch.autograd.Function):
     ) -> torch.Tensor:
         """Interpolate."""
         backend, channels = backend_for(vertices), values.shape[1]
-        ctx.mesh, ctx.flags = mesh, flags_here(backend)
+        ctx.mesh, ctx.flags = mesh, flags_here()
         ctx.save_for_backward(vertices, values, points, cells)
         if not points.shape[0]:
             return values.new_empty((0, channels))
