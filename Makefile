@@ -9,12 +9,13 @@ FUZZ_SECONDS ?= 3600
 # Tests run in one process for each core, up to four: each loads PyTorch and compiles kernels of its own.
 PYTEST := $(BIN)/python -m pytest -q --durations=10 -n auto --maxprocesses=4 --dist worksteal
 
-.PHONY: help setup demo test test-all fuzz lint bench docs clean distclean
+.PHONY: help setup demo test test-all test-cuda-emulated fuzz lint bench docs clean distclean
 
 help:
 	@echo 'make demo       reconstruct the Tooth CT scan from rendered views; pictures in out/demo'
 	@echo 'make test       lint, types and all tests but the slow ones'
 	@echo 'make test-all   lint, types and all tests, with more random examples'
+	@echo 'make test-cuda-emulated   the tests for GPUs on an emulated one; needs Linux on x86-64, a C and a C++ compiler'
 	@echo 'make fuzz       read damaged inputs of all kinds for an hour, or FUZZ_SECONDS'
 	@echo 'make lint       lint and types only'
 	@echo 'make bench      print the tables of docs/results.md'
@@ -39,6 +40,10 @@ test: lint
 test-all: lint
 	DIFFTETVR_TESTS=thorough DIFFTETVR_FUZZ=4000 $(PYTEST)
 
+# Kernels are translated and compiled once, into build/cuda_emulation; see tools/cuda_emulation.
+test-cuda-emulated: setup
+	PYTHONPATH=tools $(PYTEST) -p cuda_emulation.plugin -m gpu
+
 fuzz: setup
 	PYTHONPATH=src:tests $(BIN)/python -m fuzz --seconds $(FUZZ_SECONDS)
 
@@ -59,7 +64,7 @@ docs:
 
 clean:
 	rm -rf docs/_build docs/gallery out build dist .pytest_cache .hypothesis .mypy_cache .ruff_cache
-	find src tests examples benchmarks scripts -name __pycache__ -type d -prune -exec rm -rf {} +
+	find src tests examples benchmarks scripts tools -name __pycache__ -type d -prune -exec rm -rf {} +
 
 distclean: clean
 	rm -rf .venv

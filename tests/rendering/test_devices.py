@@ -1,8 +1,14 @@
 """The same kernels on a GPU give what they give on the CPU."""
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import pytest
 import torch
 
+from difftetvr import libcuda
 from difftetvr.backend import BackendWarning, default_device, dr, get_backend
 from difftetvr.errors import BackendError
 from difftetvr.mesh import Field, TetMesh
@@ -53,3 +59,71 @@ def test_a_gpu_that_is_left_unused_is_told_of(monkeypatch: pytest.MonkeyPatch) -
         return
     with pytest.warns(BackendWarning, match="GPU is left unused: The CUDA back end cannot start .*DRJIT_LIBCUDA_PATH"):
         assert default_device().type == "cpu"
+
+
+def leaf(shape: tuple[int, ...], seed: int) -> torch.Tensor:
+    return torch.rand(shape, generator=torch.Generator().manual_seed(seed))
+
+
+@pytest.mark.gpu
+def test_views_that_begin_in_the_midst_of_a_packet() -> None:
+    """Kernels load packets of 16 bytes, and a GPU faults where one does not begin at a multiple of them."""
+    backend = get_backend("cuda", torch.float32)
+    view = torch.arange(9.0, device="cuda")[1:]
+    assert view.data_ptr() % 16
+    packets = dr.gather(backend.Float4, backend.floats(view), dr.arange(backend.UInt, 2))
+    assert packets.numpy().T.tolist() == [[1, 2, 3, 4], [5, 6, 7, 8]]
+
+
+@pytest.mark.gpu
+def test_reduced_precision_of_products_does_not_reach_images() -> None:
+    """Products of float32 matrices in TF32 would move vertices by a thousandth of their distance."""
+    before = torch.get_float32_matmul_precision()
+    images = []
+    try:
+        for precision in ("highest", "high"):
+            torch.set_float32_matmul_precision(precision)
+            images.append(loss_and_gradients("cuda", torch.float32, CAMERAS["outside"])[:3])
+    finally:
+        torch.set_float32_matmul_precision(before)
+    for exact, reduced in zip(*images, strict=True):
+        assert torch.equal(exact, reduced)
+
+
+@pytest.mark.gpu
+def test_what_another_stream_writes_is_waited_for() -> None:
+    mesh = TetMesh.grid((3, 3, 3), dtype=torch.float32).to("cuda")
+    color, density = leaf((mesh.num_vertices, 3), 0).to("cuda"), leaf((mesh.num_vertices,), 1).to("cuda")
+    expected = render(mesh, Field(color, density), CAMERAS["outside"]).color
+    stream = torch.cuda.Stream()
+    stream.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(stream):
+        large = torch.ones(1000, 1000, device="cuda")
+        for _ in range(50):
+            large = (large @ large).clamp(max=1.0)  # keeps the stream busy; all elements are 1
+        written = Field(color * large[0, 0], density * large[0, 0])
+        assert torch.equal(render(mesh, written, CAMERAS["outside"]).color, expected)
+
+
+@pytest.mark.gpu
+def test_an_order_of_sums_cannot_be_asked_of_a_gpu() -> None:
+    mesh = TetMesh.grid((2, 2, 2), dtype=torch.float32).to("cuda")
+    density = leaf((mesh.num_vertices,), 1).to("cuda").requires_grad_()
+    field = Field(leaf((mesh.num_vertices, 3), 0).to("cuda"), density)
+    image = render(mesh, field, CAMERAS["outside"], deterministic=True)
+    with pytest.warns(BackendWarning, match="deterministic=True does not reach the cuda kernels"):
+        image.color.sum().backward()
+
+
+@pytest.mark.gpu
+def test_the_driver_of_machines_without_development_packages_is_found(tmp_path: Path) -> None:
+    """They have ``libcuda.so.1`` alone, and no variable that names it."""
+    found = os.environ.get(libcuda.PATH_VARIABLE)
+    if not found or not Path(found).is_file():
+        pytest.skip("the driver's place is not known")
+    (tmp_path / libcuda.REAL_NAME).symlink_to(found)
+    environment = {name: value for name, value in os.environ.items() if name != libcuda.PATH_VARIABLE}
+    environment |= {"LD_LIBRARY_PATH": str(tmp_path), "PYTHONPATH": os.pathsep.join(sys.path)}
+    code = "from difftetvr.backend import dr; print(bool(dr.has_backend(dr.JitBackend.CUDA)))"
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["True"]

@@ -138,3 +138,20 @@ def test_mistakes_get_one_sentence(change: dict[str, Any], message: str) -> None
     with pytest.raises(MeshError, match=message) as error:
         probe(**{"mesh": mesh, "values": torch.rand(27), "points": torch.rand(4, 3), **change})
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 5e-6), (torch.float64, 1e-12)])
+def test_values_and_derivatives_on_a_gpu(dtype: torch.dtype, tolerance: float) -> None:
+    generator = torch.Generator().manual_seed(11)
+    points = torch.rand(500, 3, generator=generator, dtype=torch.float64).to(dtype)
+    values = torch.rand(60, 2, generator=generator, dtype=torch.float64).to(dtype)
+    found = []
+    for device in ("cpu", "cuda"):
+        mesh = bent_mesh(dtype=dtype).to(device)
+        leaves = [part.to(device).requires_grad_() for part in (mesh.vertices.detach(), values, points)]
+        at_points = probe(mesh.with_vertices(leaves[0]), leaves[1], leaves[2], outside=0.0)
+        gradients = torch.autograd.grad((at_points * at_points.detach().cos()).sum(), leaves)
+        found.append([part.detach().cpu() for part in (at_points, *gradients)])
+    for on_cpu, on_gpu in zip(*found, strict=True):
+        assert float((on_cpu - on_gpu).norm()) <= tolerance * float(on_cpu.norm())

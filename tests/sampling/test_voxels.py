@@ -117,3 +117,14 @@ def test_mistakes_get_one_sentence(change: dict[str, Any], message: str) -> None
     with pytest.raises(MeshError, match=message) as error:
         voxelise(TetMesh.grid((2, 2, 2)), **{**arguments, **change})
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("samples", [1, 2])
+def test_on_a_gpu(samples: int) -> None:
+    mesh = bent_mesh()
+    values = torch.rand(mesh.num_vertices, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    grid = ((0.1, 0.0, -0.1), 0.08, (9, 12, 11))
+    on_cpu = voxelise(mesh, values, *grid, samples=samples, outside=-1.0)
+    on_gpu = voxelise(mesh.to("cuda"), values.to("cuda"), *grid, samples=samples, outside=-1.0)
+    torch.testing.assert_close(on_gpu.cpu(), on_cpu, rtol=0.0, atol=1e-12)

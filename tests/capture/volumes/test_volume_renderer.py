@@ -149,3 +149,15 @@ def test_invalid_settings() -> None:
         renderer.render([])
     with pytest.raises(CaptureError, match="image size"):
         renderer.render([fibonacci_orbit(1)[0], fibonacci_orbit(1, width=64)[0]])
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 5e-5), (torch.float64, 1e-12)])
+def test_a_gpu_sees_what_the_cpu_sees(dtype: torch.dtype, tolerance: float) -> None:
+    cameras = fibonacci_orbit(3, width=22, height=18)
+    on_cpu, on_gpu = (
+        VolumeRenderer(TOOTH, TOOTH_FUNCTION, 25.0, 300.0, device, dtype).render(cameras) for device in ("cpu", "cuda")
+    )
+    for one, other in zip(on_cpu, on_gpu, strict=True):
+        assert float(one.max()) > 0.1
+        np.testing.assert_allclose(other.cpu(), one, rtol=0.0, atol=tolerance)

@@ -1,0 +1,24 @@
+"""How often a host waits for a GPU: counted where the device is emulated, which ``make test-cuda-emulated`` does."""
+
+import sys
+
+import pytest
+
+pytestmark = pytest.mark.gpu
+
+COUNTED = {
+    "marching, image": 1,
+    "marching, by colours and densities": 1,
+    "marching, by vertices, too": 1,
+}
+
+
+@pytest.mark.parametrize("name", COUNTED)
+def test_a_rendering_and_its_backward_pass_wait_once(name: str) -> None:
+    if "cuda_emulation.started" not in sys.modules:
+        pytest.skip("a GPU's driver does not count")
+    from cuda_emulation.host_waits import calls, waits_of
+
+    launches, waits = waits_of(calls()[name])
+    assert launches > 0
+    assert waits.total() == COUNTED[name], waits
