@@ -10,17 +10,16 @@ from dataclasses import dataclass
 
 import torch
 
-from difftetvr.mesh.arrays import chunks, true_indices
+from difftetvr.fitting.refinement.collapse_kernel import costs_of_collapses
+from difftetvr.mesh.arrays import true_indices
 from difftetvr.mesh.changes.change import MeshChange
 from difftetvr.mesh.changes.flips import FOUR_TO_FOUR, TWO_TO_THREE, Flips
 from difftetvr.mesh.tetmesh import TetMesh
-from difftetvr.mesh.topology.incidence import cell_faces, cells_per_edge, find_edges, stars
+from difftetvr.mesh.topology.incidence import cell_faces, cells_per_edge, find_edges
 from difftetvr.mesh.topology.topology import Topology
 from difftetvr.rendering.gauss_newton import HatDerivatives, ImageModel
 
-_CELLS_OF_VERTEX = 24
 _DAMPING = 0.01
-_ON_A_FACE = 1e-6  # so far outside of a cell, in barycentric coordinates, a point still counts as inside
 
 
 @dataclass(frozen=True)
@@ -114,9 +113,7 @@ def collapse_costs(
     target = torch.repeat_interleave(torch.tensor([len(c) for c in candidates], device=rows.device))
     kept = edges[rows].gather(1, target[:, None])[:, 0]
     removed = edges[rows].sum(1) - kept
-    cost = torch.empty(len(rows), dtype=values.dtype, device=values.device)
-    for part in chunks(len(rows), rows.device, width=_CELLS_OF_VERTEX):
-        cost[part] = _cost(mesh, values, vertices[removed[part]], removed[part], kept[part])
+    cost = costs_of_collapses(mesh, values, vertices, removed, kept).to(values.dtype)
     found = true_indices(torch.isfinite(cost))
     cells = cells_per_edge(mesh.topology)[rows[found]]
     return CollapseCosts(rows[found], target[found], cost[found], cells)
@@ -128,50 +125,6 @@ def _neighbour_mean(edges: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
         sums.index_add_(0, edges[:, one], values[edges[:, other]])
         counts += torch.bincount(edges[:, one], minlength=len(values))
     return sums / counts.clamp_min(1.0)[:, None]
-
-
-def _cost(
-    mesh: TetMesh, values: torch.Tensor, hats: HatDerivatives, removed: torch.Tensor, kept: torch.Tensor
-) -> torch.Tensor:
-    """(N,) cost of merging `removed` into `kept`, whose `hats` are those of the removed ones; NaN where impossible."""
-    owner, cells = stars(mesh.topology, removed)
-    tets = mesh.tets[cells].long()
-    rows = true_indices(~(tets == kept[owner, None]).any(1))
-    owner, tets = owner[rows], tets[rows]
-    # A new cell has the face opposite the removed vertex, and the kept one as its apex.
-    corners = torch.cat((tets[tets != removed[owner, None]].view(-1, 3), kept[owner, None]), 1)
-    weights, volume = _barycentric(mesh.vertices.detach().double(), corners, removed[owner])
-    # What each new cell's linear function is at the removed vertex's place; only the one that holds it shows it there.
-    extrapolated = (weights.to(values.dtype)[:, :, None] * values[corners]).sum(1)
-    least = torch.nan_to_num(weights.amin(1), -torch.inf, -torch.inf, -torch.inf)
-    best = torch.full((len(removed),), -torch.inf, dtype=torch.float64, device=values.device)
-    best.scatter_reduce_(0, owner, least, "amax")
-    holds = true_indices((least == best[owner]) & (least > -_ON_A_FACE))
-    after = torch.full((len(removed), 4), torch.nan, dtype=values.dtype, device=values.device)
-    after[owner[holds]] = extrapolated[holds]
-
-    # The old and the new cell at a face overlap down to this share of the way to the apex. There, the other new cells
-    # differ from what the hat explains by how much their functions differ, seen from the removed vertex's place.
-    sides, towards_apex = weights[:, :3], weights[:, 3]
-    reach = 1.0 / (towards_apex + 3.0 * sides.amax(1).clamp_min(0.0)).clamp_min(_ON_A_FACE)
-    deviation = reach.to(values.dtype)[:, None] * (extrapolated - after[owner])
-    bends = hats[owner].curvature(deviation) * volume.to(values.dtype)
-    total = torch.zeros_like(hats.emission).index_add_(0, owner, volume.to(values.dtype))
-    bent = torch.zeros_like(total).index_add_(0, owner, bends) / total
-    return 0.5 * (bent + hats.curvature(after - values[removed]))
-
-
-def _barycentric(
-    positions: torch.Tensor, corners: torch.Tensor, vertices: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Coordinates (N, 4) of vertices (N,) in tetrahedra (N, 4), and the tetrahedra's volumes (N,) times six."""
-    apex = positions[corners[:, 3]]
-    a, b, c = (positions[corners[:, k]] - apex for k in range(3))
-    place = positions[vertices] - apex
-    normals = (torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b))
-    volume = (a * normals[0]).sum(1)
-    weights = torch.stack([(place * normal).sum(1) for normal in normals], 1) / volume[:, None]
-    return torch.cat((weights, 1.0 - weights.sum(1, keepdim=True)), 1), volume.abs()
 
 
 def flip_gains(flips: Flips, values: torch.Tensor, model: ImageModel) -> torch.Tensor:
