@@ -104,6 +104,10 @@ class Backend:
         """The numbers 0 to ``count`` - 1, in memory: of kernels that read them Dr.Jit knows the size."""
         return _lanes(self.UInt, count)
 
+    def constant(self, value: int) -> Any:
+        """An integer as a device value that is made once."""
+        return _constant(self.UInt, value)
+
     def run(self, *arrays: Any) -> None:
         """Compute arrays, and wait for them unless PyTorch's work on the GPU waits by itself.
 
@@ -122,21 +126,21 @@ class Backend:
         return tensor.view(shape) if shape else tensor
 
     @contextmanager
-    def exclusive(self, one_thread: bool = False) -> Iterator[None]:
+    def exclusive(self, in_order: bool = False, most_threads: int = 1) -> Iterator[None]:
         """Run kernels while no other Python thread does.
 
         Dr.Jit's pool of threads is one a process, and kernels use all of it, so renderings take turns.
 
         Args:
-            one_thread: Run them on one CPU thread, so that sums over rays are taken in a fixed order. Has no effect on
-                GPUs, whose atomic additions have no order.
+            in_order: Whether sums over rays are taken in a fixed order. GPUs cannot: their atomic additions have none.
+            most_threads: CPU threads that they may then run on.
 
         Raises:
             BackendError: This process was forked from one that had run kernels.
         """
         require_own_threads()
         _watch_forks()
-        if one_thread and self.name != "llvm":
+        if in_order and self.name != "llvm":
             warnings.warn(
                 f"deterministic=True does not reach the {self.name} kernels: gradients add up in an order that changes "
                 "from run to run; pass deterministic=False, or move the tensors to the CPU.",
@@ -146,9 +150,11 @@ class Backend:
         with _TURN:
             # Values of the forward pass may be asked for by autograd's thread, which Dr.Jit must be told of.
             dr.detail.new_scope(dr.backend_v(self.Float))
-            threads = dr.thread_count() if one_thread and self.name == "llvm" else 0
+            threads = dr.thread_count() if in_order and self.name == "llvm" else 0
+            if threads <= most_threads:
+                threads = 0
             if threads:
-                dr.set_thread_count(1)
+                dr.set_thread_count(most_threads)
             try:
                 yield
             finally:
@@ -179,6 +185,11 @@ def _lanes(uint: Any, count: int) -> Any:
     numbers = dr.arange(uint, count)
     dr.make_opaque(numbers)
     return numbers
+
+
+@lru_cache(maxsize=256)
+def _constant(uint: Any, value: int) -> Any:
+    return dr.opaque(uint, value)
 
 
 def eager(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:

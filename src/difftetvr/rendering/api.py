@@ -126,8 +126,8 @@ def render(
         optics: Optical model of one cell; exact integration of the linear field if None.
         transmittance_threshold: Rays stop once their transmittance is at or below this value, in [0, 1), and with them
             what they integrate; 0 stops none.
-        deterministic: Whether gradients are the same in every run to the last bit: the backward pass then runs on one
-            thread. CPU only. Images always are.
+        deterministic: Whether gradients are the same in every run to the last bit, as images always are. CPU only: the
+            backward pass then runs on at most eight threads, with ``marching``, else on one.
         clip_plane: (4,) a, b, c, d: only what lies in the half-space a x + b y + c z + d >= 0 of the world is seen.
 
     Returns:

@@ -16,6 +16,7 @@ from difftetvr.rendering.kernels.composition import Composition, Pixels
 from difftetvr.rendering.kernels.forward import render_forward
 from difftetvr.rendering.kernels.gradients import Gradients, Wanted
 from difftetvr.rendering.kernels.layout import GradientSource, collect
+from difftetvr.rendering.kernels.shares import threads_in_order
 from difftetvr.rendering.search.memory_order import MemoryOrder
 from difftetvr.rendering.task import RenderTask
 from difftetvr.rendering.traversal.crossing import Tracer
@@ -61,9 +62,9 @@ class RenderFunction(torch.autograd.Function):
         needs_vertices, needs_pose, needs_background, needs_limits, needs_lines = ctx.needs_input_grad[2:7]
         wanted = Wanted(needs_vertices or needs_pose, needs_limits, needs_lines)
         derivatives = [None if part is None or not part.numel() else backend.floats(part) for part in by_image]
-        with with_flags(ctx.flags), backend.exclusive(one_thread=task.deterministic):
+        with with_flags(ctx.flags), backend.exclusive(task.deterministic, threads_in_order(shot.tracer)):
             image = ImageAdjoint(Pixels(*derivatives), ctx.how, *ctx.gathered)
-            gradients = render_adjoint(shot.tracer, image, task.mesh.num_vertices, wanted)
+            gradients = render_adjoint(shot.tracer, image, task.mesh.num_vertices, wanted, task.deterministic)
             geometry, parts = gradient_tensors(task, gradients, pose, vertices)
         by_background = None
         if needs_background and optical_depth is not None and by_image[0] is not None:
@@ -135,9 +136,8 @@ def gradient_tensors(
         return geometry, [cell_channels, cell_densities]
     parts = [cell_channels] if task.has_features else [channels] if has_channels else []
     parts.append(values)
-    if gradients.transfer is not None:
-        transfer = gradients.transfer
-        parts += [backend.tensor(transfer.knots), backend.tensor(transfer.values, -1, 4)]
+    if gradients.knots is not None:
+        parts += [backend.tensor(gradients.knots), backend.tensor(gradients.values, -1, 4)]
     return geometry, parts
 
 

@@ -15,6 +15,7 @@ from difftetvr.rendering.api import as_background
 from difftetvr.rendering.kernels.composition import Composition
 from difftetvr.rendering.kernels.forward import render_forward
 from difftetvr.rendering.kernels.hats import RECORD, HatImage, hat_records
+from difftetvr.rendering.kernels.shares import threads_in_order
 from difftetvr.rendering.preparation import ViewOptions, prepare_view
 from difftetvr.rendering.rays import Rays, RaySource
 
@@ -194,8 +195,8 @@ def model_image(
         raise DiffTetError(f"valid is {shown(valid)}; pass a bool tensor of shape {tuple(truth.shape[:2])}.")
     behind = as_background(background, mesh.vertices)
     backend = view.task.backend
-    with backend.exclusive(one_thread=deterministic):
-        tracer = view.tracer(view.limits(None))
+    tracer = view.tracer(view.limits(None))
+    with backend.exclusive(deterministic, threads_in_order(tracer)):
         how = Composition(None if behind is None else backend.floats(behind), None, view.unit)
         rendered = render_forward(tracer, how)
         image = backend.tensor(rendered.image.color, *truth.shape)
@@ -204,7 +205,11 @@ def model_image(
             residual = residual * valid.to(residual.device)[..., None]
         curvature = 2.0 / residual.numel()
         records = hat_records(
-            tracer, mesh, view.upload.order, HatImage(backend.floats(image), backend.floats(curvature * residual))
+            tracer,
+            mesh,
+            view.upload.order,
+            HatImage(backend.floats(image), backend.floats(curvature * residual)),
+            deterministic,
         )
         counts = (mesh.num_vertices, mesh.topology.edges.shape[0], mesh.topology.faces.shape[0])
         found = [

@@ -61,7 +61,7 @@ def costs_of_collapses(
     if not len(removed):
         return values.new_zeros(0, dtype=torch.float64)
     topology = mesh.topology
-    backend = get_backend(mesh.vertices.device, torch.float64)
+    backend = get_backend(str(mesh.vertices.device), torch.float64)
     offsets, cells = topology.vertex_cells
     positions = torch.nn.functional.pad(mesh.vertices.detach().double(), (0, 1))
     colors = torch.cat((hats.emission[:, None], hats.coupling), 1)

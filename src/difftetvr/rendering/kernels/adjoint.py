@@ -14,7 +14,8 @@ import drjit as dr
 
 from difftetvr.recording import replayed
 from difftetvr.rendering.kernels.composition import Composition, Pixels, pixel_adjoint
-from difftetvr.rendering.kernels.gradients import BufferSizes, Gradients, Wanted
+from difftetvr.rendering.kernels.gradients import BufferSizes, Gradients, GradientSums, Wanted
+from difftetvr.rendering.kernels.shares import Deal
 from difftetvr.rendering.kernels.walk_adjoint import AdjointRay, WalkAdjoint
 from difftetvr.rendering.traversal.crossing import Tracer
 from difftetvr.rendering.traversal.rays import Lanes
@@ -50,7 +51,9 @@ class LightAhead:
     rest: Any
 
 
-def render_adjoint(tracer: Tracer, image: ImageAdjoint, vertex_count: int, wanted: Wanted) -> Gradients:
+def render_adjoint(
+    tracer: Tracer, image: ImageAdjoint, vertex_count: int, wanted: Wanted, in_order: bool = False
+) -> Gradients:
     """Gradients of a view with respect to the field and, if asked, the vertices, the rays and their limits.
 
     Args:
@@ -58,15 +61,22 @@ def render_adjoint(tracer: Tracer, image: ImageAdjoint, vertex_count: int, wante
         image: Derivatives with respect to the image, and the image.
         vertex_count: Number of vertices V.
         wanted: What else needs gradients.
+        in_order: Whether sums over rays have a certain order, see :mod:`difftetvr.rendering.kernels.shares`.
     """
-    sizes = BufferSizes.of(tracer.view, vertex_count, wanted)
-    gradients: Gradients = replayed(_adjoint, tracer, image, sizes)
+    deal = Deal.of(tracer, in_order)
+    sizes = BufferSizes.of(tracer.view, vertex_count, wanted, deal.shares)
+    gradients: Gradients = replayed(_adjoint, tracer, image, deal, sizes, sizes.lanes(tracer.view.backend))
     return gradients
 
 
-def _adjoint(tracer: Tracer, image: ImageAdjoint, sizes: BufferSizes) -> Gradients:
-    gradients = Gradients.zeros(tracer.view.backend, sizes)
-    tracer.trace(lambda rays: _AdjointKernel(tracer, rays, image, gradients))
+def _adjoint(tracer: Tracer, image: ImageAdjoint, deal: Deal, sizes: BufferSizes, lanes: list[Any | None]) -> Gradients:
+    sums = GradientSums.zeros(tracer.view.backend, sizes)
+
+    def run(part: Tracer, copy: Any | None) -> None:
+        part.trace(lambda rays: _AdjointKernel(part, rays, image, sums.of_copy(copy)))
+
+    deal.trace(tracer, run)
+    gradients = sums.total(lanes)
     dr.eval(gradients)
     return gradients
 
@@ -74,7 +84,7 @@ def _adjoint(tracer: Tracer, image: ImageAdjoint, sizes: BufferSizes) -> Gradien
 class _AdjointKernel(WalkAdjoint):
     """The adjoint of emission and absorption."""
 
-    def __init__(self, tracer: Tracer, rays: Lanes, image: ImageAdjoint, gradients: Gradients) -> None:
+    def __init__(self, tracer: Tracer, rays: Lanes, image: ImageAdjoint, gradients: GradientSums) -> None:
         view = tracer.view
         backend, pixel, valid = view.backend, rays.pixel, rays.valid
         *seen, optical_depth = view.records.gather(backend, image.light, pixel, valid)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,9 +10,12 @@ import drjit as dr
 
 from difftetvr.backend import Backend
 from difftetvr.recording import few_lengths
+from difftetvr.rendering.kernels.shares import Shares
 from difftetvr.rendering.traversal.crossing import View
+from difftetvr.rendering.traversal.sums import Sums
 from difftetvr.rendering.traversal.transfer import TransferGradients
 
+_POSITION = 4  # floats of a record of a position
 _EXPAND_BUDGET = 1 << 30  # bytes of per-thread gradient copies; beyond it threads share one copy through atomics
 
 
@@ -26,74 +30,134 @@ class Wanted:
 
 @dataclass
 class Gradients:
-    """Flat gradient buffers.
+    """Flat gradients.
 
     Attributes:
         field: Of at least V vertices, (M, width) records of channels and density, or (M,) densities or scalars; None
             where cells hold the density.
         cells: Of at least T cells, (M, width) records of channels and density; None where they hold nothing.
         vertices: (M, 4): x, y, z in the space of the vertices and padding; None if positions need no gradient.
+        knots: (K,) of the knots of the transfer function; None if there is none.
+        values: (K, 4) of its densities and linear RGB; likewise.
         limits: (N, 2): the distances between which rays are looked at; None if they need no gradient.
         lines: (N, 6): the rays' origins and directions; None if they need no gradient.
-        transfer: The transfer function; None if there is none.
-        mode: How additions of several rays to one record are reduced.
     """
 
     field: Any | None
     cells: Any | None
     vertices: Any | None
+    knots: Any | None
+    values: Any | None
     limits: Any | None
     lines: Any | None
+
+
+@dataclass
+class GradientSums:
+    """What kernels add to, or store in, to make :class:`Gradients` of; the attributes are those."""
+
+    field: Sums | None
+    cells: Sums | None
+    vertices: Sums | None
     transfer: TransferGradients | None
-    mode: dr.ReduceMode
+    limits: Any | None
+    lines: Any | None
 
     @staticmethod
-    def zeros(backend: Backend, sizes: BufferSizes) -> Gradients:
-        """Buffers of some sizes, for kernels that add to them."""
-        field, cells, vertices, limits, lines = (
-            None if size is None else dr.zeros(backend.Float, size)
-            for size in (sizes.field, sizes.cells, sizes.vertices, sizes.limits, sizes.lines)
+    def zeros(backend: Backend, sizes: BufferSizes) -> GradientSums:
+        """Buffers of some sizes."""
+        shares = sizes.shares
+
+        def sums(size: int | None, width: int) -> Sums | None:
+            return None if size is None else Sums.zeros(backend, size, size // width, shares.copies, sizes.mode)
+
+        knots, values = sums(sizes.knots, 1), sums(sizes.values, 1)
+        return GradientSums(
+            sums(sizes.field, sizes.width),
+            sums(sizes.cells, sizes.width),
+            sums(sizes.vertices, _POSITION),
+            None if knots is None or values is None else TransferGradients(knots, values),
+            *(None if size is None else dr.zeros(backend.Float, size) for size in (sizes.limits, sizes.lines)),
         )
-        transfer = None
-        if sizes.transfer is not None:
-            transfer = TransferGradients(*(dr.zeros(backend.Float, size) for size in sizes.transfer))
-        return Gradients(field, cells, vertices, limits, lines, transfer, sizes.mode)
+
+    def of_copy(self, copy: Any | None) -> GradientSums:
+        """The same for lanes that each add to a copy of their own."""
+        field, cells, vertices = (
+            None if sums is None else sums.of_copy(copy) for sums in (self.field, self.cells, self.vertices)
+        )
+        transfer = self.transfer
+        if transfer is not None:
+            transfer = TransferGradients(transfer.knots.of_copy(copy), transfer.values.of_copy(copy))
+        return GradientSums(field, cells, vertices, transfer, self.limits, self.lines)
+
+    def total(self, lanes: Sequence[Any | None]) -> Gradients:
+        """The sums of all copies.
+
+        Args:
+            lanes: Numbers of the floats of each buffer, see :meth:`BufferSizes.lanes`.
+        """
+        transfer = self.transfer
+        parts = [self.field, self.cells, self.vertices]
+        parts += [None, None] if transfer is None else [transfer.knots, transfer.values]
+        pairs = zip(parts, lanes, strict=True)
+        field, cells, vertices, knots, values = (None if part is None else part.total(lane) for part, lane in pairs)
+        return Gradients(field, cells, vertices, knots, values, self.limits, self.lines)
 
 
 @dataclass(frozen=True)
 class BufferSizes:
-    """Floats in each of the buffers of :class:`Gradients`, None for those that are not there, and its mode."""
+    """Floats in each of the buffers of :class:`Gradients`, None for those that are not there.
+
+    Attributes:
+        width: Floats in a record of ``field`` and ``cells``.
+        shares: Copies of the buffers.
+        mode: How additions of several rays to one record are reduced.
+    """
 
     field: int | None
     cells: int | None
     vertices: int | None
+    knots: int | None
+    values: int | None
     limits: int | None
     lines: int | None
-    transfer: tuple[int, int] | None
+    width: int
+    shares: Shares
     mode: dr.ReduceMode
 
     @staticmethod
-    def of(view: View, vertex_count: int, wanted: Wanted) -> BufferSizes:
+    def of(view: View, vertex_count: int, wanted: Wanted, shares: Shares) -> BufferSizes:
         """Sizes for a view of V vertices; few different ones, for kernels are compiled for them."""
-        width, transfer = view.records.width, view.transfer
+        transfer = view.transfer
+        width = view.records.width if view.has_vertex_channels or view.cells is not None else 1
         field = None if view.has_cell_density else width if view.has_vertex_channels else 1
         if field is not None:
             field *= few_lengths(vertex_count)
         cells = None if view.cells is None else width * few_lengths(dr.width(view.cells) // width)
-        vertices = 4 * few_lengths(vertex_count) if wanted.vertices else None
+        vertices = _POSITION * few_lengths(vertex_count) if wanted.vertices else None
         return BufferSizes(
             field,
             cells,
             vertices,
+            knots=None if transfer is None else dr.width(transfer.knots),
+            values=None if transfer is None else dr.width(transfer.values),
             limits=2 * view.rays.count if wanted.limits else None,
             lines=6 * view.rays.count if wanted.lines else None,
-            transfer=None if transfer is None else (dr.width(transfer.knots), dr.width(transfer.values)),
-            mode=reduce_mode(view, sum(size or 0 for size in (field, cells, vertices))),
+            width=width,
+            shares=shares,
+            mode=reduce_mode(view, sum(size or 0 for size in (field, cells, vertices)), shares),
         )
 
+    def lanes(self, backend: Backend) -> list[Any | None]:
+        """Numbers of the floats of all buffers that are added to, for those who add up copies; None for one copy."""
+        sizes = (self.field, self.cells, self.vertices, self.knots, self.values)
+        return [None if size is None or self.shares.copies == 1 else backend.lanes(size) for size in sizes]
 
-def reduce_mode(view: View, floats: int) -> dr.ReduceMode:
+
+def reduce_mode(view: View, floats: int, shares: Shares) -> dr.ReduceMode:
     """On CPUs one gradient copy a thread beats atomics, as long as the copies fit a budget."""
+    if shares.copies > 1:
+        return dr.ReduceMode.NoConflicts
     if view.backend.name != "llvm":
         return dr.ReduceMode.Auto
     size = floats * (8 if view.backend.is_double else 4) * dr.thread_count()

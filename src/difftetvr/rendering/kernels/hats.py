@@ -28,6 +28,7 @@ from difftetvr.mesh.topology.incidence import cell_edges, cell_faces
 from difftetvr.mesh.topology.topology import LOCAL_EDGE_OF, LOCAL_EDGES, Topology
 from difftetvr.recording import few_lengths, replayed
 from difftetvr.rendering.kernels.gradients import reduce_mode
+from difftetvr.rendering.kernels.shares import Deal
 from difftetvr.rendering.search.memory_order import MemoryOrder
 from difftetvr.rendering.traversal.crossing import (
     Span,
@@ -39,6 +40,7 @@ from difftetvr.rendering.traversal.crossing import (
     read_vertex,
 )
 from difftetvr.rendering.traversal.rays import Lanes
+from difftetvr.rendering.traversal.sums import Sums
 from difftetvr.rendering.traversal.walk import Corner, Exit, Face
 
 RECORD = 12
@@ -85,12 +87,24 @@ class HatImage:
 
 @dataclass
 class HatRecords:
-    """Flat buffers of ``RECORD`` floats for each vertex, edge and face."""
+    """Flat arrays of ``RECORD`` floats for each vertex, edge and face."""
 
     vertices: Any
     edges: Any
     faces: Any
-    mode: dr.ReduceMode
+
+
+@dataclass
+class _HatSums:
+    """What the kernel adds to to make them."""
+
+    vertices: Sums
+    edges: Sums
+    faces: Sums
+
+    def of_copy(self, copy: Any | None) -> _HatSums:
+        """The same for lanes that each add to a copy of their own."""
+        return _HatSums(*(sums.of_copy(copy) for sums in (self.vertices, self.edges, self.faces)))
 
 
 @dataclass
@@ -135,7 +149,9 @@ class _Samples:
         return total
 
 
-def hat_records(tracer: Tracer, mesh: TetMesh, order: MemoryOrder, image: HatImage) -> HatRecords:
+def hat_records(
+    tracer: Tracer, mesh: TetMesh, order: MemoryOrder, image: HatImage, in_order: bool = False
+) -> HatRecords:
     """Sums over the rays of a view for every vertex, edge and face.
 
     Args:
@@ -143,26 +159,45 @@ def hat_records(tracer: Tracer, mesh: TetMesh, order: MemoryOrder, image: HatIma
         mesh: The mesh that is seen.
         order: Its order in memory, which is that of the records of vertices; edges and faces are in the mesh's.
         image: The rendered image, and the derivative of the loss with respect to it.
+        in_order: Whether sums over rays have a certain order, see :mod:`difftetvr.rendering.kernels.shares`.
     """
-    view, topology = tracer.view, mesh.topology
+    view, topology, deal = tracer.view, mesh.topology, Deal.of(tracer, in_order)
     counts = [few_lengths(n) for n in (mesh.num_vertices, topology.edges.shape[0], topology.faces.shape[0])]
-    mode = reduce_mode(view, RECORD * sum(counts))
-    records: HatRecords = replayed(_records, tracer, HatTables.of(view, mesh, order), image, counts, mode)
+    mode = reduce_mode(view, RECORD * sum(counts), deal.shares)
+    lanes = [None if deal.lane is None else view.backend.lanes(RECORD * count) for count in counts]
+    records: HatRecords = replayed(
+        _records, tracer, HatTables.of(view, mesh, order), image, deal, _Buffers(counts, mode, lanes)
+    )
     return records
 
 
-def _records(tracer: Tracer, tables: HatTables, image: HatImage, counts: list[int], mode: dr.ReduceMode) -> HatRecords:
-    vertices, edges, faces = (dr.zeros(tracer.view.backend.Float, RECORD * count) for count in counts)
-    records = HatRecords(vertices, edges, faces, mode)
-    tracer.trace(lambda rays: _HatKernel(tracer, rays, tables, records, image))
-    dr.eval(vertices, edges, faces)
-    return records
+@dataclass
+class _Buffers:
+    """Numbers of records, how additions are reduced, and numbers of the floats; None where there is but one copy."""
+
+    counts: list[int]
+    mode: dr.ReduceMode
+    lanes: list[Any | None]
+
+
+def _records(tracer: Tracer, tables: HatTables, image: HatImage, deal: Deal, buffers: _Buffers) -> HatRecords:
+    backend, copies = tracer.view.backend, deal.shares.copies
+    parts = [Sums.zeros(backend, RECORD * count, count, copies, buffers.mode) for count in buffers.counts]
+    sums = _HatSums(*parts)
+
+    def run(part: Tracer, copy: Any | None) -> None:
+        part.trace(lambda rays: _HatKernel(part, rays, tables, sums.of_copy(copy), image))
+
+    deal.trace(tracer, run)
+    totals = HatRecords(*(part.total(lane) for part, lane in zip(parts, buffers.lanes, strict=True)))
+    dr.eval(totals)
+    return totals
 
 
 class _HatKernel:
     """Gathers responses; see :class:`difftetvr.rendering.traversal.crossing.Kernel`."""
 
-    def __init__(self, tracer: Tracer, rays: Lanes, tables: HatTables, records: HatRecords, image: HatImage) -> None:
+    def __init__(self, tracer: Tracer, rays: Lanes, tables: HatTables, records: _HatSums, image: HatImage) -> None:
         self.view, self.rays, self.tables, self.records = tracer.view, rays, tables, records
         self.span = Span.of(tracer, rays)
         pixel, valid = rays.pixel, rays.valid
@@ -271,14 +306,14 @@ class _HatKernel:
             self._scatter(self.records.faces, cell.face(opposite), samples.respond(_DROPPED, other, _APEX), True)
         return samples.respond(_AFTER, _BEFORE, _APEX)
 
-    def _scatter(self, buffer: Any, index: Any, response: Response, active: Any) -> None:
+    def _scatter(self, sums: Sums, index: Any, response: Response, active: Any) -> None:
         b, d, g = response[0], response[1:], self.gradient
         zero = dr.zeros_like(b)
         slope = dr.fma(g[0], d[0], dr.fma(g[1], d[1], g[2] * d[2]))
         square = dr.fma(d[0], d[0], dr.fma(d[1], d[1], d[2] * d[2]))
         record = [g[0] * b, g[1] * b, g[2] * b, slope, b * b, *(b * v for v in d), square, b, zero, zero]
         # In one piece: on GPUs, threads of a warp that share a record have to find each other but once.
-        dr.scatter_add(buffer, self.view.backend.Floats(record), index, active, mode=self.records.mode)
+        sums.add(self.view.backend.Floats(record), index, active)
 
     def _no_response(self) -> Response:
         return [dr.zeros(self.view.backend.Float, dr.width(self.rays.pixel)) for _ in range(4)]

@@ -13,8 +13,9 @@ import drjit as dr
 
 from difftetvr.optics.special import depth_of
 from difftetvr.recording import replayed
-from difftetvr.rendering.kernels.gradients import BufferSizes, Gradients, Wanted
+from difftetvr.rendering.kernels.gradients import BufferSizes, Gradients, GradientSums, Wanted
 from difftetvr.rendering.kernels.segments import SegmentKernel
+from difftetvr.rendering.kernels.shares import Deal
 from difftetvr.rendering.kernels.walk_adjoint import AdjointRay, WalkAdjoint
 from difftetvr.rendering.traversal.crossing import Tracer, inverse_length
 from difftetvr.rendering.traversal.rays import Lanes
@@ -113,7 +114,9 @@ def ask_distances(tracer: Tracer, depths: Table, count: int) -> Answers:
     return answers
 
 
-def depths_adjoint(tracer: Tracer, depths: Weighed, vertex_count: int, wanted: Wanted) -> Gradients:
+def depths_adjoint(
+    tracer: Tracer, depths: Weighed, vertex_count: int, wanted: Wanted, in_order: bool = False
+) -> Gradients:
     """Gradients of optical depths at distances with respect to all but the distances.
 
     Args:
@@ -121,15 +124,22 @@ def depths_adjoint(tracer: Tracer, depths: Weighed, vertex_count: int, wanted: W
         depths: Where they are looked at, and what they are worth.
         vertex_count: Number of vertices V.
         wanted: What needs gradients beside the field.
+        in_order: Whether sums over rays have a certain order, see :mod:`difftetvr.rendering.kernels.shares`.
     """
-    sizes = BufferSizes.of(tracer.view, vertex_count, wanted)
-    gradients: Gradients = replayed(_adjoint, tracer, depths, sizes)
+    deal = Deal.of(tracer, in_order)
+    sizes = BufferSizes.of(tracer.view, vertex_count, wanted, deal.shares)
+    gradients: Gradients = replayed(_adjoint, tracer, depths, deal, sizes, sizes.lanes(tracer.view.backend))
     return gradients
 
 
-def _adjoint(tracer: Tracer, depths: Weighed, sizes: BufferSizes) -> Gradients:
-    gradients = Gradients.zeros(tracer.view.backend, sizes)
-    tracer.trace(lambda rays: _DepthsAdjoint(tracer, rays, depths, gradients))
+def _adjoint(tracer: Tracer, depths: Weighed, deal: Deal, sizes: BufferSizes, lanes: list[Any | None]) -> Gradients:
+    sums = GradientSums.zeros(tracer.view.backend, sizes)
+
+    def run(part: Tracer, copy: Any | None) -> None:
+        part.trace(lambda rays: _DepthsAdjoint(part, rays, depths, sums.of_copy(copy)))
+
+    deal.trace(tracer, run)
+    gradients = sums.total(lanes)
     dr.eval(gradients)
     return gradients
 
@@ -240,7 +250,7 @@ class _DistancesKernel(_ProfileKernel):
 class _DepthsAdjoint(WalkAdjoint):
     """The adjoint of optical depths at distances: of the density, weighed by all distances that are still ahead."""
 
-    def __init__(self, tracer: Tracer, rays: Lanes, depths: Weighed, gradients: Gradients) -> None:
+    def __init__(self, tracer: Tracer, rays: Lanes, depths: Weighed, gradients: GradientSums) -> None:
         super().__init__(tracer, rays, gradients, [])
         self.distances, self.weights, self.ahead = depths.distances, depths.weights, depths.ahead
 

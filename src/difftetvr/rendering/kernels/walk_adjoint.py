@@ -14,7 +14,7 @@ from typing import Any
 
 import drjit as dr
 
-from difftetvr.rendering.kernels.gradients import Gradients
+from difftetvr.rendering.kernels.gradients import GradientSums
 from difftetvr.rendering.traversal.crossing import (
     Clip,
     Span,
@@ -55,7 +55,7 @@ class WalkAdjoint:
     to vertices, cells, knots, limits and rays is here.
     """
 
-    def __init__(self, tracer: Tracer, rays: Lanes, gradients: Gradients, color: list[Any]) -> None:
+    def __init__(self, tracer: Tracer, rays: Lanes, gradients: GradientSums, color: list[Any]) -> None:
         """Begin.
 
         Args:
@@ -185,7 +185,7 @@ class WalkAdjoint:
                 for v in (piece.start_values, piece.end_values)
             ]
             progress, at_start, at_end = self.cross(ends[0], ends[1], progress, is_crossed)
-            adjoint = PieceAdjoint(transfer, piece, start, end, gradients, self.gradients.mode)
+            adjoint = PieceAdjoint(transfer, piece, start, end, gradients)
             return progress, adjoint.add(at_start, at_end, color, total), seen + at_start[2] + at_end[2]
 
         zeros = [[dr.zeros_like(start[0]) for _ in range(2)] for _ in range(2)]
@@ -235,17 +235,18 @@ class WalkAdjoint:
 
     def _scatter(self, vertex: Any, adjoints: list[Any], active: Any) -> None:
         if self.field_slots == 1:
-            dr.scatter_add(self.gradients.field, adjoints[0], vertex, active, mode=self.gradients.mode)
+            assert self.gradients.field is not None
+            self.gradients.field.add(adjoints[0], vertex, active)
         elif self.field_slots:
             self._scatter_record(self.gradients.field, vertex, adjoints[0], adjoints[1], active)
         if self.gradients.vertices is not None:
             position = self.rays.frame.unproject(*adjoints[self.field_slots :])
             record = self.view.backend.Float4(*position, 0.0)
-            dr.scatter_add(self.gradients.vertices, record, vertex, active, mode=self.gradients.mode)
+            self.gradients.vertices.add(record, vertex, active)
 
-    def _scatter_record(self, buffer: Any, index: Any, density: Any, radiance: Any, active: Any) -> None:
+    def _scatter_record(self, sums: Any, index: Any, density: Any, radiance: Any, active: Any) -> None:
         record = [radiance * g for g in self.color] + [density]
-        self.view.records.scatter_add(self.view.backend, buffer, record, index, active, self.gradients.mode)
+        self.view.records.add(self.view.backend, sums, record, index, active)
 
 
 def _unclip(clip: Clip, step: Step, at_start: list[Any], at_end: list[Any]) -> tuple[list[Any], list[Any], list[Any]]:

@@ -58,6 +58,9 @@ class LinkedList:
         """Whether some crossings begin behind the camera."""
         return self.raster.starts_inside
 
+    def on_lanes(self, lane: Any) -> None:
+        """See :meth:`difftetvr.rendering.traversal.crossing.Tracer.on_lanes`."""
+
     def trace(self, make_kernel: Callable[[Lanes], Kernel]) -> None:
         """Sort every ray's fragments and cross their cells, front to back."""
         for band in self.bands:

@@ -6,7 +6,7 @@ Nothing is sorted and nothing stored per crossing: the adjoint walks again and k
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -49,6 +49,10 @@ class Marching:
     def starts_inside(self) -> bool:
         """Whether some walks start behind the ray's origin."""
         return self.entries.has_starts
+
+    def on_lanes(self, lane: Any) -> Marching:
+        """See :meth:`difftetvr.rendering.traversal.crossing.Tracer.on_lanes`."""
+        return replace(self, view=replace(self.view, lane=lane))
 
     def trace(self, make_kernel: Callable[[Lanes], Kernel]) -> None:
         """Walk every ray through all cells it crosses, front to back."""

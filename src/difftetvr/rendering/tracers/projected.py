@@ -61,6 +61,9 @@ class Projected:
         starts_inside = bool(vertices[:, 2].amin() <= 0)
         return Projected(aim.view, aim.scene, Tiler(aim.scene, cells.order, PAIR_BUDGET), starts_inside)
 
+    def on_lanes(self, lane: Any) -> None:
+        """See :meth:`difftetvr.rendering.traversal.crossing.Tracer.on_lanes`."""
+
     def trace(self, make_kernel: Callable[[Lanes], Kernel]) -> None:
         """Cross the cells of every tile, front to back."""
         rays = lanes_of(self.view)

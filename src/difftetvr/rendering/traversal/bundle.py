@@ -46,7 +46,11 @@ class BundleRays:
     def of_lanes(self, lane: Any) -> Lanes:
         """The rays of some lanes."""
         valid = lane < self.size
-        pixel = lane if self.order is None else dr.gather(self.backend.UInt, self.order, lane, valid)
+        # Lanes behind the last ray read that of another.
+        if self.order is None:
+            pixel = dr.select(valid, lane, 0)
+        else:
+            pixel = dr.gather(self.backend.UInt, self.order, lane, valid)
         return Lanes(pixel, valid, self.of_pixels(pixel))
 
     def of_pixels(self, pixel: Any) -> Frame:

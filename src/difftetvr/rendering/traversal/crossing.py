@@ -123,6 +123,9 @@ class Tracer(Protocol):
     def trace(self, make_kernel: Callable[[Lanes], Kernel]) -> None:
         """Run a kernel on all crossings."""
 
+    def on_lanes(self, lane: Any) -> Tracer | None:
+        """The same for the rays of some lanes; None for tracers that launch more than one kernel for all rays."""
+
 
 def cross_cell(kernel: Kernel, cell: Any, vertices: list[Any], ray: Any, active: Any) -> Any:
     """One crossing on its own, that shares no corner with the one before or behind it.

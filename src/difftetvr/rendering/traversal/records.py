@@ -13,6 +13,7 @@ import drjit as dr
 import torch
 
 from difftetvr.backend import Backend
+from difftetvr.rendering.traversal.sums import Sums
 
 PACKET = 4
 
@@ -43,11 +44,9 @@ class Records:
         """Store a record."""
         dr.scatter(array, self._whole(backend, values), index, active)
 
-    def scatter_add(
-        self, backend: Backend, array: Any, values: list[Any], index: Any, active: Any, mode: dr.ReduceMode
-    ) -> None:
+    def add(self, backend: Backend, sums: Sums, values: list[Any], index: Any, active: Any) -> None:
         """Add to a record."""
-        dr.scatter_add(array, self._whole(backend, values), index, active, mode=mode)
+        sums.add(self._whole(backend, values), index, active)
 
     def _whole(self, backend: Backend, values: list[Any]) -> Any:
         # In one piece: several scatters to one array are kernels of their own, each of which computes everything.

@@ -17,6 +17,7 @@ import drjit as dr
 import torch
 
 from difftetvr.backend import Backend
+from difftetvr.rendering.traversal.sums import Sums
 from difftetvr.rendering.traversal.walk import Face
 
 
@@ -179,10 +180,10 @@ class Piece:
 
 @dataclass
 class TransferGradients:
-    """Flat gradient buffers: (K,) knots and (K, 4) densities and linear RGB."""
+    """Gradients of (K,) knots and of (K, 4) densities and linear RGB; K floats and 4 K are the records."""
 
-    knots: Any
-    values: Any
+    knots: Sums
+    values: Sums
 
 
 @dataclass
@@ -203,9 +204,8 @@ class PieceAdjoint:
         entry: list[Any],
         leaving: list[Any],
         gradients: TransferGradients,
-        mode: dr.ReduceMode,
     ) -> None:
-        self.transfer, self.piece, self.gradients, self.mode = transfer, piece, gradients, mode
+        self.transfer, self.piece, self.gradients = transfer, piece, gradients
         (t0, f0), (t1, f1) = entry, leaving
         self.speed = (t1 - t0) * _inverse(f1 - f0)
         self.lowest, self.highest = dr.fmin(f0, f1), dr.fmax(f0, f1)
@@ -273,9 +273,9 @@ class PieceAdjoint:
 
     def _scatter(self, knot: Any, values: list[Any], position: Any, pixel: list[Any]) -> None:
         record = [values[0], *(values[1] * g for g in pixel)]
-        dr.scatter_add(self.gradients.knots, position, knot, mode=self.mode)
+        self.gradients.knots.add(position, knot)
         for k, value in enumerate(record):
-            dr.scatter_add(self.gradients.values, value, 4 * knot + k, mode=self.mode)
+            self.gradients.values.add(value, 4 * knot + k)
 
 
 def _inverse(difference: Any) -> Any:
