@@ -27,12 +27,12 @@ ALLOWED = {
     "backend": GROUND,
     "recording": GROUND | {"backend"},
     "terminal": GROUND,
-    "mesh": GROUND,
+    "mesh": GROUND | {"backend", "recording"},
     "optics": GROUND | {"backend"},
     "rendering": GROUND | {"backend", "recording", "mesh", "optics"},
     "sampling": GROUND | {"backend", "mesh", "rendering"},
     "capture": GROUND | {"backend", "mesh", "optics", "rendering"},
-    "fitting": GROUND | {"backend", "terminal", "mesh", "optics", "rendering", "capture"},
+    "fitting": GROUND | {"backend", "recording", "terminal", "mesh", "optics", "rendering", "capture"},
     "view": GROUND | {"backend", "mesh", "optics", "rendering", "capture", "fitting"},
 }
 """Parts, each with the parts it may import besides itself. `cli` and the package's surface may import all.
@@ -40,7 +40,7 @@ ALLOWED = {
 `view` and `fitting` are one storey; of the two, the one that shows results may know what a result is, never the other.
 """
 
-MAY_TOUCH_DRJIT = {"backend", "recording", "optics", "rendering", "sampling", "capture"}
+MAY_TOUCH_DRJIT = {"backend", "recording", "mesh", "optics", "rendering", "sampling", "capture", "fitting"}
 """Parts that hold kernels, or torch functions around them."""
 
 

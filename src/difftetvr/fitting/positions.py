@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
+import drjit as dr
 import torch
 
 from difftetvr.errors import FitError
@@ -96,7 +98,7 @@ class VertexOptimizer:
         rate = self.config.rate if rate is None else rate
         gradient = self._finite_gradient()
         old = self.mesh.vertices.detach()
-        shapes = measure_vertices(self.mesh, self._barrier_weight)
+        shapes = measure_vertices(self.mesh, self._barrier)
         move = self._proposal(gradient, shapes, rate)
         move, capped = cap_move(self._constraint.apply(old, move), shapes.altitudes, self.config.cap)
         guarded = guard_move(self.mesh, move, self.config.limits, shapes.cells)
@@ -190,10 +192,21 @@ class VertexOptimizer:
         pull = rate * altitudes.square() * shapes.barrier_gradient
         return move - torch.where(torch.isfinite(pull), pull, 0.0)
 
-    def _barrier_weight(self, quality: torch.Tensor) -> torch.Tensor:
-        """Weight of -log Q of cells of some quality."""
-        floor = self.config.limits.quality
-        start = _WALL_START * floor
-        least = max((start - floor) / _WALL_STEEPNESS, torch.finfo(quality.dtype).tiny)
-        nearness = (start - quality).clamp_min_(0.0) / (quality - floor).clamp_min_(least)
-        return nearness.mul_(self.config.wall).add_(self.config.barrier)
+    @property
+    def _barrier(self) -> _Barrier:
+        return _Barrier(self.config.barrier, self.config.wall, self.config.limits.quality)
+
+
+@dataclass(frozen=True)
+class _Barrier:
+    """Weight of -log Q of cells by their quality Q, in kernels; the attributes are options."""
+
+    everywhere: float
+    wall: float
+    floor: float
+
+    def __call__(self, quality: Any) -> Any:
+        start = _WALL_START * self.floor
+        least = max((start - self.floor) / _WALL_STEEPNESS, torch.finfo(torch.float64).tiny)
+        nearness = dr.fmax(start - quality, 0.0) / dr.fmax(quality - self.floor, least)
+        return dr.fma(nearness, self.wall, self.everywhere)

@@ -8,7 +8,7 @@ import torch
 
 from difftetvr.mesh.arrays import true_indices
 from difftetvr.mesh.limits import MotionLimits
-from difftetvr.mesh.shapes import CellShapes, length_scale, measure_cells, scaled_axes
+from difftetvr.mesh.shapes import CellShapes, corner_columns, length_scale, measure_cells, scaled_points
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.mesh.topology.incidence import stars
 from difftetvr.mesh.topology.topology import Topology
@@ -45,7 +45,7 @@ def measure(mesh: TetMesh) -> CellShapes:
         Its cells' shapes.
     """
     scale = length_scale(mesh.vertices)
-    return CellShapes(scale, *measure_cells(mesh.topology, scaled_axes(mesh.vertices, scale)))
+    return CellShapes(scale, *measure_cells(corner_columns(mesh.topology), scaled_points(mesh.vertices, scale)))
 
 
 def cap_move(move: torch.Tensor, altitudes: torch.Tensor, fraction: float) -> tuple[torch.Tensor, int]:
@@ -97,18 +97,18 @@ def guard_move(
     new = torch.where(finite[:, None], new, old)
     moving = (new != old).any(1)
     halvings = torch.zeros(mesh.num_vertices, dtype=torch.int32, device=old.device)
-    axes = scaled_axes(new, before.scale)
+    points = scaled_points(new, before.scale)
 
     cells: torch.Tensor | None = None
     while cells is None or cells.numel():
-        bad = _bad_cells(mesh.topology, axes, limits, before, cells)
+        bad = _bad_cells(mesh.topology, points, limits, before, cells)
         vertices = torch.unique(mesh.tets.index_select(0, bad)).long()
         vertices = vertices[moving[vertices] & (halvings[vertices] <= limits.halvings)]
         halvings[vertices] += 1
         part = torch.exp2(-halvings[vertices].double())
         part = torch.where(halvings[vertices] > limits.halvings, 0.0, part)
         new[vertices] = (start[vertices] + part[:, None] * wanted[vertices]).to(old.dtype)
-        axes[:, vertices] = scaled_axes(new[vertices], before.scale)
+        points[vertices] = scaled_points(new[vertices], before.scale)
         cells = torch.unique(stars(mesh.topology, vertices)[1])
 
     refused = (halvings > limits.halvings) | ~finite
@@ -117,10 +117,13 @@ def guard_move(
 
 
 def _bad_cells(
-    topology: Topology, axes: torch.Tensor, limits: MotionLimits, before: CellShapes, cells: torch.Tensor | None
+    topology: Topology, points: torch.Tensor, limits: MotionLimits, before: CellShapes, cells: torch.Tensor | None
 ) -> torch.Tensor:
     """Indices of the bad ones among some cells, None for all."""
-    determinant, quality = measure_cells(topology, axes, cells)
+    corners = corner_columns(topology)
+    if cells is not None:
+        corners = corners.index_select(1, cells)
+    determinant, quality = measure_cells(corners, points)
     old_determinant, old_quality = before.determinants, before.qualities
     if cells is not None:
         old_determinant, old_quality = old_determinant[cells], old_quality[cells]

@@ -1,29 +1,30 @@
-"""Size and shape of all cells, and of the cells around each vertex, in one fast pass outside autograd.
+"""Size and shape of all cells, and of the cells around each vertex, outside autograd (Dr.Jit kernels, float64).
 
-`difftetvr.mesh.quality` is the differentiable twin that the tests hold this against. Here positions lie axis by axis,
-(3, V) float64, so that every gather and every operation runs over contiguous numbers: five times faster.
+`difftetvr.mesh.quality` is the differentiable twin that the tests hold this against. Where products are added up,
+fma is explicit, so that every kernel rounds alike: a cell that has not moved has the very numbers that it had before.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any
 
+import drjit as dr
 import torch
 
-from difftetvr.mesh.arrays import chunks
+from difftetvr.backend import Backend, get_backend
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.mesh.topology.topology import Topology
+from difftetvr.recording import few_lengths, replayed
 
 _QUALITY_FACTOR = math.sqrt(432.0)
 """Q = sqrt(432) det / S^(3/2), S the sum of the squared edge lengths: the same as 6 sqrt(2) V / l_rms^3."""
 
-_TEMPORARIES = 3
-"""Shrinks the slices so that the some forty temporaries of a slice stay in a core's cache."""
+_CORNERS = 4
 
-Axes = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
+Vector = list[Any]
 
 
 @dataclass(frozen=True)
@@ -69,17 +70,19 @@ def length_scale(vertices: torch.Tensor) -> torch.Tensor:
     return torch.exp2(-exponent.double().clamp(-1000, 1000))
 
 
-def scaled_axes(vertices: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
-    """Positions as contiguous x, y and z in a scaled unit.
+def scaled_points(vertices: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
+    """Positions in a scaled unit as kernels read them.
 
     Args:
         vertices: (V, 3) float32 or float64.
         scale: () float64, from `length_scale`.
 
     Returns:
-        (3, V) float64, detached.
+        (V, 4) float64, detached; the last column is padding.
     """
-    return (vertices.detach().double() * scale).t().contiguous()
+    points = vertices.new_zeros((vertices.shape[0], 4), dtype=torch.float64)
+    points[:, :3] = vertices.detach().double() * scale
+    return points
 
 
 def corner_columns(topology: Topology) -> torch.Tensor:
@@ -87,128 +90,209 @@ def corner_columns(topology: Topology) -> torch.Tensor:
     return topology.cached("mesh.shapes.corner_columns", lambda: topology.tets.t().contiguous())
 
 
-def measure_cells(
-    topology: Topology, axes: torch.Tensor, cells: torch.Tensor | None = None
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Determinants and qualities of cells.
-
-    Only sums, products, quotients and square roots are involved: equal positions give equal bits, whatever the slice.
+def measure_cells(corners: torch.Tensor, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Determinants and qualities of cells; equal positions give equal bits.
 
     Args:
-        topology: The cells.
-        axes: (3, V) float64, from `scaled_axes`.
-        cells: (N,) int64 indices of the cells wanted; None: all of them.
+        corners: (4, N) int32 their vertices, contiguous.
+        points: (V, 4) float64, from `scaled_points`.
 
     Returns:
         (N,) float64 determinants, six times the volumes, and (N,) float64 qualities; NaN where positions are.
     """
-    columns = corner_columns(topology)
-    if cells is not None:
-        columns = columns.index_select(1, cells)
-    results = axes.new_empty((2, columns.shape[1]))
-    for part in chunks(columns.shape[1], axes.device, width=_TEMPORARIES):
-        a, b, c = _edges(axes, columns[:, part])
-        determinant = _dot(a, _cross(b, c))
-        results[0, part] = determinant
-        results[1, part] = _quality(determinant, _squared_edges(a, b, c, _sum(a, b, c)))
-    return results[0], results[1]
+    if not corners.shape[1]:
+        return points.new_empty(0), points.new_empty(0)
+    backend = _backend(points)
+    with backend.exclusive():
+        determinants, qualities = replayed(_measures, _source(backend, corners, points))
+        return backend.tensor(determinants), backend.tensor(qualities)
 
 
-def measure_vertices(mesh: TetMesh, weigh: Callable[[torch.Tensor], torch.Tensor] | None = None) -> VertexShapes:
-    """Altitudes, gradient of the shape barrier, volumes and qualities of a mesh in one pass.
+def measure_vertices(mesh: TetMesh, weigh: Callable[[Any], Any] | None = None) -> VertexShapes:
+    """Altitudes, gradient of the shape barrier, volumes and qualities of a mesh.
 
     Args:
         mesh: Mesh of positive cells.
-        weigh: Weight of each cell's -log Q as a function of Q, (N,) float64 to (N,); default: 1 for all.
+        weigh: Weight of each cell's -log Q as a function of Q, on Dr.Jit's float64 arrays; default: 1 for all. Kernels
+            are recorded if it is a dataclass.
 
     Returns:
         The measures. Where a cell is so thin that float64 finds no volume, the barrier's gradient is not finite and
         the altitude is 0.
     """
-    topology = mesh.topology
-    columns = corner_columns(topology)
-    scale = length_scale(mesh.vertices)
-    axes = scaled_axes(mesh.vertices, scale)
-    cells = axes.new_empty((2, topology.num_cells))
-    altitudes = axes.new_full((topology.num_vertices,), torch.inf)
-    gradient = torch.zeros_like(axes)
-    for part in chunks(topology.num_cells, axes.device, width=_TEMPORARIES):
-        corners = [column.contiguous() for column in columns[:, part].unbind()]
-        shape = _shape(axes, columns[:, part], weigh)
-        cells[0, part] = shape.determinant
-        cells[1, part] = shape.quality
-        for corner, forces in zip(corners, shape.gradients):
-            altitudes.scatter_reduce_(0, corner.long(), shape.altitude, "amin")
-            for target, force in zip(gradient, forces):
-                target.index_add_(0, corner, force)
-    altitudes = torch.where(torch.isfinite(altitudes), altitudes, 0.0).clamp_min_(0.0)
-    return VertexShapes(altitudes / scale, gradient.t() * scale, CellShapes(scale, cells[0], cells[1]))
+    topology, scale = mesh.topology, length_scale(mesh.vertices)
+    points = scaled_points(mesh.vertices, scale)
+    if not topology.num_cells:
+        nothing = points.new_empty(0)
+        return VertexShapes(
+            torch.zeros_like(points[:, 0]), torch.zeros_like(points[:, :3]), CellShapes(scale, nothing, nothing)
+        )
+    backend = _backend(points)
+    offsets, cells = topology.vertex_cells
+    with backend.exclusive():
+        source, length = _source(backend, corner_columns(topology), points), few_lengths(topology.num_cells)
+        determinants, qualities, corners = replayed(_shapes, source, weigh, length)
+        first, end, around, tets = map(backend.uints, (offsets[:-1], offsets[1:], cells, topology.tets))
+        stars = _StarSource(backend, first, end, around, tets, corners)
+        sums = replayed(_sums_of_stars, stars, few_lengths(topology.num_vertices))
+        of_cells = CellShapes(scale, backend.tensor(determinants), backend.tensor(qualities))
+        of_vertices = backend.tensor(sums, -1, 4)[: topology.num_vertices]
+    altitudes = of_vertices[:, 3]
+    # Comparisons with NaN are false: what cannot be computed has no altitude.
+    altitudes = torch.where(torch.isfinite(altitudes) & (altitudes > 0), altitudes, 0.0)
+    return VertexShapes(altitudes / scale, of_vertices[:, :3] * scale, of_cells)
 
 
-class _Shape(NamedTuple):
-    determinant: torch.Tensor
-    quality: torch.Tensor
-    altitude: torch.Tensor
-    gradients: tuple[Axes, Axes, Axes, Axes]
+def _backend(points: torch.Tensor) -> Backend:
+    return get_backend(str(points.device), torch.float64)
 
 
-def _shape(axes: torch.Tensor, columns: torch.Tensor, weigh: Callable[[torch.Tensor], torch.Tensor] | None) -> _Shape:
-    """Everything about some cells; gradients are those of -log Q with respect to their four corners."""
-    a, b, c = _edges(axes, columns)
+def _source(backend: Backend, corners: torch.Tensor, points: torch.Tensor) -> _CellSource:
+    return _CellSource(backend, backend.floats(points), [backend.uints(column) for column in corners])
+
+
+# ---- Kernels
+
+
+@dataclass
+class _CellSource:
+    """Cells, flat.
+
+    Attributes:
+        backend: Array types, float64.
+        points: (V, 4) positions, and padding.
+        corners: Four arrays (N,) of their vertices.
+    """
+
+    backend: Backend
+    points: Any
+    corners: list[Any]
+
+    def edges(self) -> tuple[Vector, Vector, Vector]:
+        """Edges from the first corner."""
+        first, *others = ([packet[k] for k in range(3)] for packet in map(self._packet, self.corners))
+        a, b, c = ([x - y for x, y in zip(other, first, strict=True)] for other in others)
+        return a, b, c
+
+    def _packet(self, corner: Any) -> Any:
+        return dr.gather(self.backend.Float4, self.points, corner)
+
+
+@dataclass
+class _StarSource:
+    """The cells around vertices, flat.
+
+    Attributes:
+        backend: Array types, float64.
+        first, end: (V,) where each vertex's cells begin and end among ``cells``.
+        cells: (4 T,) the cells.
+        tets: (T, 4) their vertices.
+        corners: (T, 4, 4) what :func:`_shapes` says about each corner of a cell.
+    """
+
+    backend: Backend
+    first: Any
+    end: Any
+    cells: Any
+    tets: Any
+    corners: Any
+
+
+def _measures(source: _CellSource) -> tuple[Any, Any]:
+    """Determinants and qualities of cells, for :func:`difftetvr.recording.replayed`."""
+    a, b, c = source.edges()
+    determinant = _dot(a, _cross(b, c))
+    quality = _quality(determinant, _squared_edges(a, b, c, _sum(a, b, c)))
+    dr.eval(determinant, quality)
+    return determinant, quality
+
+
+def _shapes(source: _CellSource, weigh: Callable[[Any], Any] | None, length: int) -> tuple[Any, Any, Any]:
+    """The same, and for each corner of a cell the gradient of -log Q and the cell's least altitude.
+
+    Args:
+        source: The cells.
+        weigh: Weight of -log Q by Q; None: 1.
+        length: Number of cells to make room for.
+
+    Returns:
+        Determinants, qualities, and flat (length, 4, 4) gradients with the altitude behind them.
+    """
+    a, b, c = source.edges()
     # Twice the area vectors of the faces opposite corners 1, 2 and 3, pointing inwards; all four add up to zero.
     normals = (_cross(b, c), _cross(c, a), _cross(a, b))
-    total_normal = _sum(*normals)
-    determinant = _dot(a, normals[0])
+    total_normal, total = _sum(*normals), _sum(a, b, c)
+    determinant, squares = _dot(a, normals[0]), _squared_edges(a, b, c, total)
+    quality = _quality(determinant, squares)
     largest = _dot(total_normal, total_normal)
     for normal in normals:
-        largest = torch.maximum(largest, _dot(normal, normal))
-    total = _sum(a, b, c)
-    squares = _squared_edges(a, b, c, total)
+        largest = dr.fmax(largest, _dot(normal, normal))
+    altitude = determinant / dr.sqrt(largest)
 
     # -log Q = -log det + 3/2 log S; the gradient of det at corner k is its normal, that of S is 2 (4 x_k - sum of x).
-    quality = _quality(determinant, squares)
-    weight = torch.ones_like(quality) if weigh is None else weigh(quality)
+    weight = dr.ones_like(quality) if weigh is None else weigh(quality)
     by_normal, by_edge = weight / determinant, 3.0 * weight / squares
     pull = [by_edge * t for t in total]
-    by_edge = 4.0 * by_edge
-    second, third, fourth = (
-        _axes(by_edge * e - p - by_normal * n for e, p, n in zip(edge, pull, normal))
-        for edge, normal in zip((a, b, c), normals)
-    )
-    first = _axes(by_normal * n - p for n, p in zip(total_normal, pull))
-    altitude = determinant / largest.sqrt()
-    return _Shape(determinant, quality, altitude, (first, second, third, fourth))
+    record = [*(dr.fma(by_normal, n, -p) for n, p in zip(total_normal, pull, strict=True)), altitude]
+    for edge, normal in zip((a, b, c), normals, strict=True):
+        parts = zip(edge, pull, normal, strict=True)
+        record += [dr.fma(4.0 * by_edge, e, -p) - by_normal * n for e, p, n in parts]
+        record.append(altitude)
+    corners = dr.empty(source.backend.Float, len(record) * length)
+    dr.scatter(corners, source.backend.Floats(record), dr.arange(source.backend.UInt, dr.width(source.corners[0])))
+    dr.eval(determinant, quality, corners)
+    return determinant, quality, corners
 
 
-def _edges(axes: torch.Tensor, columns: torch.Tensor) -> tuple[Axes, Axes, Axes]:
-    """Edges from the first corner."""
-    origin, *others = columns.unbind()
-    start = [axis.index_select(0, origin) for axis in axes]
-    a, b, c = (_axes(axis.index_select(0, end).sub_(s) for axis, s in zip(axes, start)) for end in others)
-    return a, b, c
+def _sums_of_stars(source: _StarSource, length: int) -> Any:
+    """What vertices feel of the cells around them, for :func:`difftetvr.recording.replayed`.
+
+    Args:
+        source: The cells around them.
+        length: Number of vertices to make room for.
+
+    Returns:
+        Flat (length, 4): sums of the gradients, and the least altitude; infinite where there are no cells.
+    """
+    backend, lanes = source.backend, dr.width(source.first)
+    vertex = dr.arange(backend.UInt, lanes)
+
+    def add(place: Any, total: Vector, altitude: Any) -> tuple[Any, Vector, Any]:
+        cell = dr.gather(backend.UInt, source.cells, place)
+        tet = dr.gather(backend.UInt4, source.tets, cell)
+        corner = dr.select(
+            tet[0] == vertex,
+            backend.UInt(0),
+            dr.select(tet[1] == vertex, backend.UInt(1), dr.select(tet[2] == vertex, backend.UInt(2), 3)),
+        )
+        packet = dr.gather(backend.Float4, source.corners, _CORNERS * cell + corner)
+        least = dr.select(packet[3] < altitude, packet[3], altitude)
+        return place + 1, [t + packet[k] for k, t in enumerate(total)], least
+
+    begin = (source.first, [dr.zeros(backend.Float, lanes) for _ in range(3)], dr.full(backend.Float, dr.inf, lanes))
+    _, total, altitude = dr.while_loop(begin, lambda place, *_: place < source.end, add)
+    result = dr.empty(backend.Float, 4 * length)
+    dr.scatter(result, backend.Floats([*total, altitude]), vertex)
+    dr.eval(result)
+    return result
 
 
-def _axes(values: Iterable[torch.Tensor]) -> Axes:
-    x, y, z = values
-    return x, y, z
+def _cross(p: Vector, q: Vector) -> Vector:
+    return [dr.fma(p[i], q[j], -(p[j] * q[i])) for i, j in ((1, 2), (2, 0), (0, 1))]
 
 
-def _cross(p: Axes, q: Axes) -> Axes:
-    return p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0]
+def _dot(p: Vector, q: Vector) -> Any:
+    return dr.fma(p[0], q[0], dr.fma(p[1], q[1], p[2] * q[2]))
 
 
-def _dot(p: Axes, q: Axes) -> torch.Tensor:
-    return p[0] * q[0] + p[1] * q[1] + p[2] * q[2]
+def _sum(p: Vector, q: Vector, r: Vector) -> Vector:
+    return [x + y + z for x, y, z in zip(p, q, r, strict=True)]
 
 
-def _sum(p: Axes, q: Axes, r: Axes) -> Axes:
-    return p[0] + q[0] + r[0], p[1] + q[1] + r[1], p[2] + q[2] + r[2]
-
-
-def _squared_edges(a: Axes, b: Axes, c: Axes, total: Axes) -> torch.Tensor:
+def _squared_edges(a: Vector, b: Vector, c: Vector, total: Vector) -> Any:
     """Sum of the six squared edge lengths; the subtraction cancels at most three quarters."""
-    return 4.0 * (_dot(a, a) + _dot(b, b) + _dot(c, c)) - _dot(total, total)
+    return dr.fma(4.0, _dot(a, a) + _dot(b, b) + _dot(c, c), -_dot(total, total))
 
 
-def _quality(determinant: torch.Tensor, squares: torch.Tensor) -> torch.Tensor:
-    return _QUALITY_FACTOR * determinant / (squares * squares.sqrt())
+def _quality(determinant: Any, squares: Any) -> Any:
+    return _QUALITY_FACTOR * determinant / (squares * dr.sqrt(squares))

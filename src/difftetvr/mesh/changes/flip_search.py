@@ -10,11 +10,10 @@ import torch
 from difftetvr.mesh import quality
 from difftetvr.mesh.arrays import chunks, true_indices
 from difftetvr.mesh.changes.flips import FOUR_TO_FOUR, THREE_TO_TWO, TWO_TO_THREE, Flips, cells_after
-from difftetvr.mesh.shapes import length_scale, measure_cells, scaled_axes
+from difftetvr.mesh.shapes import corner_columns, length_scale, measure_cells, scaled_points
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.mesh.topology.incidence import find_edges, stars
 from difftetvr.mesh.topology.rings import closed_rings
-from difftetvr.mesh.topology.topology import Topology
 
 _WIDTH = 10
 """Numbers for each flip in the temporaries of a chunk."""
@@ -34,9 +33,9 @@ def find_flips(mesh: TetMesh, *, min_quality: float = 0.1) -> Flips:
         The flips: 2-3 in the order of their faces in `mesh.topology.faces`, then 3-2 and 4-4 in the order of the edges
         that vanish in `mesh.topology.edges`. An edge with four cells around it may have two 4-4 flips.
     """
-    axes = scaled_axes(mesh.vertices, length_scale(mesh.vertices))
-    shapes = _Shapes(mesh, axes, *measure_cells(mesh.topology, axes), min_quality)
-    sources = _across_faces(mesh), _around_edges_of_three(mesh), _around_edges_of_four(mesh, axes)
+    points = scaled_points(mesh.vertices, length_scale(mesh.vertices))
+    shapes = _Shapes(mesh, points, *measure_cells(corner_columns(mesh.topology), points), min_quality)
+    sources = _across_faces(mesh), _around_edges_of_three(mesh), _around_edges_of_four(mesh, points)
     flips = Flips.joined([_possible(shapes, candidates) for source in sources for candidates in source])
     return flips.select(~_is_there(flips))
 
@@ -46,7 +45,7 @@ class _Shapes:
     """What candidates are judged by: positions, volumes and qualities as `measure_cells` has them, and the floor."""
 
     mesh: TetMesh
-    axes: torch.Tensor
+    points: torch.Tensor
     determinants: torch.Tensor
     qualities: torch.Tensor
     min_quality: float
@@ -81,7 +80,7 @@ def _around_edges_of_three(mesh: TetMesh) -> Iterator[_Candidates]:
         yield _Candidates(THREE_TO_TWO, cells[part], edge[part], ring[part])
 
 
-def _around_edges_of_four(mesh: TetMesh, axes: torch.Tensor) -> Iterator[_Candidates]:
+def _around_edges_of_four(mesh: TetMesh, points: torch.Tensor) -> Iterator[_Candidates]:
     """4-4 flips of edges with four cells, to either diagonal of the ring."""
     old_edge, old_ring, old_cells = closed_rings(mesh.topology, 4)
     (u, v), (a, b, c, d) = old_edge.unbind(1), old_ring.unbind(1)
@@ -92,7 +91,7 @@ def _around_edges_of_four(mesh: TetMesh, axes: torch.Tensor) -> Iterator[_Candid
         edge, ring, cells = edges[part], rings[part], all_cells[part]
         # The new edge pierces a face at the old one on the side where it passes it. That shall be the first three of
         # the ring, and the first cells those at that face: one with the first end of the edge, one with the second.
-        side, _ = _measure(axes, torch.cat((ring[:, [2, 0]], edge), 1))
+        side, _ = _measure(points, torch.cat((ring[:, [2, 0]], edge), 1))
         other = (side < 0.0)[:, None]
         cells, ring = torch.where(other, cells.flip(1), cells), torch.where(other, ring.roll(2, 1), ring)
         yield _Candidates(FOUR_TO_FOUR, cells, edge, ring)
@@ -101,7 +100,7 @@ def _around_edges_of_four(mesh: TetMesh, axes: torch.Tensor) -> Iterator[_Candid
 def _possible(shapes: _Shapes, candidates: _Candidates) -> Flips:
     """Those candidates whose new cells are good enough."""
     new = cells_after(candidates.kind, candidates.edge, candidates.ring)
-    determinants, after = _measure(shapes.axes, new)
+    determinants, after = _measure(shapes.points, new)
     after = after.amin(0)
     before = _of_cells(shapes.qualities, candidates.cells).amin(0)
     rows = true_indices((after > quality.FLAT) & (after >= before.clamp_max(shapes.min_quality)))
@@ -128,9 +127,9 @@ def _of_cells(values: torch.Tensor, cells: torch.Tensor) -> torch.Tensor:
     return values.index_select(0, cells.t().reshape(-1)).view(cells.shape[1], -1)
 
 
-def _measure(axes: torch.Tensor, cells: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def _measure(points: torch.Tensor, cells: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Determinants and qualities, of the leading shape of `cells` (..., 4), which need not be those of a mesh."""
-    determinants, qualities = measure_cells(Topology(cells.view(-1, 4), axes.shape[1]), axes)
+    determinants, qualities = measure_cells(cells.view(-1, 4).t().contiguous(), points)
     return determinants.view(cells.shape[:-1]), qualities.view(cells.shape[:-1])
 
 
