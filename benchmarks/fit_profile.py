@@ -25,6 +25,7 @@ from difftetvr.fitting import trainer as trainer_module
 from difftetvr.fitting.parameters import FieldParameters
 from difftetvr.fitting.positions import VertexOptimizer
 from difftetvr.fitting.refinement import exchange_round
+from difftetvr.fitting.refinement.pixels import Judgement
 from difftetvr.fitting.trainer import Trainer
 from difftetvr.rendering.search import memory_order
 
@@ -36,12 +37,12 @@ PARTS: dict[str, tuple[Any, str]] = {
     "steps of the field": (FieldParameters, "step"),
     "steps of vertices": (VertexOptimizer, "step"),
     "order in memory": (memory_order, "_ordered"),
-    "models of images": (Trainer, "_model"),
+    "models of images": (Judgement, "model"),
     "flips": (exchange_round._Round, "flip"),
     "collapses": (exchange_round._Round, "collapse"),
     "bisections": (exchange_round._Round, "bisect"),
     "what edges win": (exchange_round, "bisection_gains"),
-    "errors before and after": (Trainer, "_error"),
+    "errors before and after": (Judgement, "error"),
     "carrying parameters": (Trainer, "_apply"),
 }
 

@@ -241,8 +241,15 @@ class FitConfig:
             count: How many; all views where there are fewer.
             view_count: Number of training views.
         """
-        random = np.random.default_rng([self.seed, _REFINEMENT_STREAM, iteration])
-        return [int(k) for k in random.permutation(view_count)[:count]]
+        return [int(k) for k in self.refinement_random(iteration).permutation(view_count)[:count]]
+
+    def refinement_random(self, iteration: int) -> np.random.Generator:
+        """Chance for what a refinement is judged on.
+
+        Args:
+            iteration: Iterations done.
+        """
+        return np.random.default_rng([self.seed, _REFINEMENT_STREAM, iteration])
 
     def rate_at(self, iteration: int) -> float:
         """Learning rate of a step, log-linear from ``rate`` (iteration 0) to ``final_rate`` (the last one)."""

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import astuple
-from functools import reduce
-from operator import add
-from typing import TYPE_CHECKING
 
 import torch
 
@@ -21,16 +18,14 @@ from difftetvr.fitting.metrics import psnr_of_mse
 from difftetvr.fitting.parameters import FieldParameters
 from difftetvr.fitting.positions import StepReport, VertexOptimizer
 from difftetvr.fitting.records.checkpoint import Checkpoint, describe_capture, require_same_capture
-from difftetvr.fitting.records.evaluation import evaluate, rendered_image, true_image, valid_share, where_valid
+from difftetvr.fitting.records.evaluation import evaluate, true_image, valid_share, where_valid
 from difftetvr.fitting.records.history import History, MoveTotals, RefinementRecord
 from difftetvr.fitting.records.result import Progress
 from difftetvr.fitting.refinement import Moment, Refinement, Situation, Strategy
+from difftetvr.fitting.refinement.pixels import Judgement
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.rendering import render
-from difftetvr.rendering.gauss_newton import ImageModel, model_image
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
+from difftetvr.rendering.gauss_newton import ImageModel
 
 _GLANCE_VIEWS = 4
 _LEAST_SHARE = 1e-6  # of the pixels: a view that is masked altogether has no error
@@ -229,17 +224,20 @@ class Trainer:
     def _refine_if_due(self) -> None:
         if self.strategy is None or not self.strategy.is_due(self._moment()):
             return
-        count = len(self._train_views)
-        positions = self.config.refinement_views_at(self.iteration, self.strategy.views, count)
-        views = [self._train_views[position] for position in positions]
-        mesh = self.mesh
+        judgement, mesh = self._judgement(self.strategy.views), self.mesh
+        models: list[ImageModel] = []
+
+        def model() -> ImageModel:
+            models.append(judgement.model(mesh, self.parameters.detached_field(), self.config.deterministic))
+            return models[0].with_density_unit(self.capture.density_unit)
+
         values = self.parameters.values(self.capture.density_unit)
         refinement = self.strategy.refine(
-            Situation(mesh, values, self._moment(), lambda: self._model(views), self._color_gradients, self._free_space)
+            Situation(mesh, values, self._moment(), model, self._color_gradients, self._free_space)
         )
         if refinement is None:
             return
-        before = self._error(views)
+        before = judgement.error(mesh, self.parameters.detached_field())
         self._apply(refinement)
         self.history.refinements.append(
             RefinementRecord(
@@ -252,9 +250,22 @@ class Trainer:
                 flipped=refinement.flipped,
                 predicted=refinement.predicted,
                 error_before=before,
-                error_after=self._error(views),
+                error_after=judgement.error(self.mesh, self.parameters.detached_field()),
             )
         )
+
+    def _judgement(self, views: int) -> Judgement:
+        """What a refinement is judged on."""
+        positions = self.config.refinement_views_at(self.iteration, views, len(self._train_views))
+        judgement = Judgement.of(
+            self.capture,
+            [self._train_views[position] for position in positions],
+            self.mesh,
+            self.config.background_at(self.iteration),
+            self.config.refinement_random(self.iteration),
+        )
+        # Colours by direction are known for rays that start at one point.
+        return judgement if self.parameters.harmonics is not None else judgement.together()
 
     def _apply(self, refinement: Refinement) -> None:
         for change in refinement.changes:
@@ -267,40 +278,9 @@ class Trainer:
         if refinement.surplus is not None:
             self.parameters.add(refinement.surplus, self.capture.density_unit)
 
-    def _model(self, views: Sequence[int]) -> ImageModel:
-        """Mean over views of the quadratic models of the squared error, densities in the capture's unit."""
-        field = self.parameters.detached_field()
-        background = self.config.background_at(self.iteration)
-        deterministic = self.config.deterministic
-        models = (
-            model_image(
-                self.mesh,
-                field,
-                self.capture.cameras[view],
-                true_image(self.capture, view, background),
-                background,
-                deterministic=deterministic,
-                valid=None if self.capture.valid is None else self.capture.valid[view],
-            )
-            for view in views
-        )
-        return reduce(add, models).scaled(1.0 / len(views)).with_density_unit(self.capture.density_unit)
-
     def _share(self, view: int) -> float:
         """Share of a view's pixels that count, by which means over all pixels are divided; never 0."""
         return max(valid_share(self.capture, view), _LEAST_SHARE)
-
-    def _error(self, views: Sequence[int]) -> float:
-        """Mean squared error over views."""
-        field = self.parameters.detached_field()
-        background = self.config.background_at(self.iteration)
-        errors = []
-        for view in views:
-            truth = true_image(self.capture, view, background)
-            image = rendered_image(self.mesh, field, self.capture, view, background)
-            squares = (where_valid(self.capture, view, image, truth) - truth).square()
-            errors.append(float(squares.mean()) / self._share(view))
-        return sum(errors) / len(errors)
 
     def _color_gradients(self) -> torch.Tensor:
         """(V,) sums over all training views of the absolute derivatives of the loss by the vertices' colours."""

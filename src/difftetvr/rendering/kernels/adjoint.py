@@ -19,6 +19,7 @@ from difftetvr.rendering.kernels.shares import Deal
 from difftetvr.rendering.kernels.walk_adjoint import AdjointRay, WalkAdjoint
 from difftetvr.rendering.traversal.crossing import Tracer
 from difftetvr.rendering.traversal.rays import Lanes
+from difftetvr.rendering.traversal.sums import Copies
 
 
 @dataclass
@@ -65,18 +66,20 @@ def render_adjoint(
     """
     deal = Deal.of(tracer, in_order)
     sizes = BufferSizes.of(tracer.view, vertex_count, wanted, deal.shares)
-    gradients: Gradients = replayed(_adjoint, tracer, image, deal, sizes, sizes.lanes(tracer.view.backend))
+    gradients: Gradients = replayed(_adjoint, tracer, image, deal, sizes, sizes.copies(tracer.view.backend))
     return gradients
 
 
-def _adjoint(tracer: Tracer, image: ImageAdjoint, deal: Deal, sizes: BufferSizes, lanes: list[Any | None]) -> Gradients:
-    sums = GradientSums.zeros(tracer.view.backend, sizes)
+def _adjoint(
+    tracer: Tracer, image: ImageAdjoint, deal: Deal, sizes: BufferSizes, copies: list[Copies | None]
+) -> Gradients:
+    sums = GradientSums.zeros(tracer.view.backend, sizes, copies)
 
     def run(part: Tracer, copy: Any | None) -> None:
         part.trace(lambda rays: _AdjointKernel(part, rays, image, sums.of_copy(copy)))
 
     deal.trace(tracer, run)
-    gradients = sums.total(lanes)
+    gradients = sums.total()
     dr.eval(gradients)
     return gradients
 

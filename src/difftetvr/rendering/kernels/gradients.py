@@ -12,7 +12,7 @@ from difftetvr.backend import Backend
 from difftetvr.recording import few_lengths
 from difftetvr.rendering.kernels.shares import Shares
 from difftetvr.rendering.traversal.crossing import View
-from difftetvr.rendering.traversal.sums import Sums
+from difftetvr.rendering.traversal.sums import Copies, Sums
 from difftetvr.rendering.traversal.transfer import TransferGradients
 
 _POSITION = 4  # floats of a record of a position
@@ -64,18 +64,23 @@ class GradientSums:
     lines: Any | None
 
     @staticmethod
-    def zeros(backend: Backend, sizes: BufferSizes) -> GradientSums:
-        """Buffers of some sizes."""
-        shares = sizes.shares
+    def zeros(backend: Backend, sizes: BufferSizes, copies: Sequence[Copies | None]) -> GradientSums:
+        """Buffers of some sizes.
 
-        def sums(size: int | None, width: int) -> Sums | None:
-            return None if size is None else Sums.zeros(backend, size, size // width, shares.copies, sizes.mode)
-
-        knots, values = sums(sizes.knots, 1), sums(sizes.values, 1)
+        Args:
+            backend: Array types.
+            sizes: The sizes.
+            copies: What :meth:`BufferSizes.copies` says about them.
+        """
+        number = sizes.shares.copies
+        field, cells, vertices, knots, values = (
+            None if size is None else Sums.zeros(backend, size, places, number, sizes.mode)
+            for size, places in zip(sizes.summed, copies, strict=True)
+        )
         return GradientSums(
-            sums(sizes.field, sizes.width),
-            sums(sizes.cells, sizes.width),
-            sums(sizes.vertices, _POSITION),
+            field,
+            cells,
+            vertices,
             None if knots is None or values is None else TransferGradients(knots, values),
             *(None if size is None else dr.zeros(backend.Float, size) for size in (sizes.limits, sizes.lines)),
         )
@@ -90,17 +95,12 @@ class GradientSums:
             transfer = TransferGradients(transfer.knots.of_copy(copy), transfer.values.of_copy(copy))
         return GradientSums(field, cells, vertices, transfer, self.limits, self.lines)
 
-    def total(self, lanes: Sequence[Any | None]) -> Gradients:
-        """The sums of all copies.
-
-        Args:
-            lanes: Numbers of the floats of each buffer, see :meth:`BufferSizes.lanes`.
-        """
+    def total(self) -> Gradients:
+        """The sums of all copies."""
         transfer = self.transfer
         parts = [self.field, self.cells, self.vertices]
         parts += [None, None] if transfer is None else [transfer.knots, transfer.values]
-        pairs = zip(parts, lanes, strict=True)
-        field, cells, vertices, knots, values = (None if part is None else part.total(lane) for part, lane in pairs)
+        field, cells, vertices, knots, values = (None if part is None else part.total() for part in parts)
         return Gradients(field, cells, vertices, knots, values, self.limits, self.lines)
 
 
@@ -148,10 +148,18 @@ class BufferSizes:
             mode=reduce_mode(view, sum(size or 0 for size in (field, cells, vertices)), shares),
         )
 
-    def lanes(self, backend: Backend) -> list[Any | None]:
-        """Numbers of the floats of all buffers that are added to, for those who add up copies; None for one copy."""
-        sizes = (self.field, self.cells, self.vertices, self.knots, self.values)
-        return [None if size is None or self.shares.copies == 1 else backend.lanes(size) for size in sizes]
+    @property
+    def summed(self) -> tuple[int | None, ...]:
+        """Sizes of the buffers that many rays add to."""
+        return self.field, self.cells, self.vertices, self.knots, self.values
+
+    def copies(self, backend: Backend) -> list[Copies | None]:
+        """Where the copies of these are; None where there is but one."""
+        if self.shares.copies == 1:
+            return [None for _ in self.summed]
+        widths = (self.width, self.width, _POSITION, 1, 1)
+        pairs = zip(self.summed, widths, strict=True)
+        return [None if size is None else Copies.of(backend, size, width) for size, width in pairs]
 
 
 def reduce_mode(view: View, floats: int, shares: Shares) -> dr.ReduceMode:

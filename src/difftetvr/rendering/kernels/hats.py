@@ -40,7 +40,7 @@ from difftetvr.rendering.traversal.crossing import (
     read_vertex,
 )
 from difftetvr.rendering.traversal.rays import Lanes
-from difftetvr.rendering.traversal.sums import Sums
+from difftetvr.rendering.traversal.sums import Copies, Sums
 from difftetvr.rendering.traversal.walk import Corner, Exit, Face
 
 RECORD = 12
@@ -164,32 +164,33 @@ def hat_records(
     view, topology, deal = tracer.view, mesh.topology, Deal.of(tracer, in_order)
     counts = [few_lengths(n) for n in (mesh.num_vertices, topology.edges.shape[0], topology.faces.shape[0])]
     mode = reduce_mode(view, RECORD * sum(counts), deal.shares)
-    lanes = [None if deal.lane is None else view.backend.lanes(RECORD * count) for count in counts]
+    copies = [None if deal.lane is None else Copies.of(view.backend, RECORD * count, RECORD) for count in counts]
     records: HatRecords = replayed(
-        _records, tracer, HatTables.of(view, mesh, order), image, deal, _Buffers(counts, mode, lanes)
+        _records, tracer, HatTables.of(view, mesh, order), image, deal, _Buffers(counts, mode, copies)
     )
     return records
 
 
 @dataclass
 class _Buffers:
-    """Numbers of records, how additions are reduced, and numbers of the floats; None where there is but one copy."""
+    """Numbers of records, how additions are reduced, and where copies are; None where there is but one."""
 
     counts: list[int]
     mode: dr.ReduceMode
-    lanes: list[Any | None]
+    copies: list[Copies | None]
 
 
 def _records(tracer: Tracer, tables: HatTables, image: HatImage, deal: Deal, buffers: _Buffers) -> HatRecords:
-    backend, copies = tracer.view.backend, deal.shares.copies
-    parts = [Sums.zeros(backend, RECORD * count, count, copies, buffers.mode) for count in buffers.counts]
+    backend, number = tracer.view.backend, deal.shares.copies
+    pairs = zip(buffers.counts, buffers.copies, strict=True)
+    parts = [Sums.zeros(backend, RECORD * count, copies, number, buffers.mode) for count, copies in pairs]
     sums = _HatSums(*parts)
 
     def run(part: Tracer, copy: Any | None) -> None:
         part.trace(lambda rays: _HatKernel(part, rays, tables, sums.of_copy(copy), image))
 
     deal.trace(tracer, run)
-    totals = HatRecords(*(part.total(lane) for part, lane in zip(parts, buffers.lanes, strict=True)))
+    totals = HatRecords(*(part.total() for part in parts))
     dr.eval(totals)
     return totals
 

@@ -25,15 +25,9 @@ _MOST_LAUNCHES = 64
 
 @dataclass(frozen=True)
 class Shares:
-    """How the lanes of a kernel are dealt out to copies of what it adds to.
-
-    Attributes:
-        copies: Number of copies.
-        lanes: Lanes that add to each of them in one launch.
-    """
+    """To how many copies of what they add to the lanes of a kernel are dealt out."""
 
     copies: int = 1
-    lanes: int = 0
 
 
 @dataclass
@@ -43,11 +37,13 @@ class Deal:
     Attributes:
         shares: How lanes are dealt out.
         lane: Numbers of the lanes of one launch; None where all lanes add to one copy.
+        lanes_of_a_copy: How many of them add to each copy.
         starts: The first lane of each launch.
     """
 
     shares: Shares
     lane: Any | None
+    lanes_of_a_copy: Any | None
     starts: list[Any]
 
     @staticmethod
@@ -58,12 +54,12 @@ class Deal:
         """
         backend, lane_count = tracer.view.backend, tracer.view.rays.lane_count
         if not in_order or backend.name != "llvm" or dr.thread_count() == 1:
-            return Deal(Shares(), None, [])
+            return Deal(Shares(), None, None, [])
         copies = 2 * dr.thread_count()
         packets = -(-lane_count // (copies * _WIDEST_PACKET))
         lanes = min(_LANES_OF_A_BLOCK, packets * _WIDEST_PACKET)
         starts = [backend.constant(start) for start in range(0, lane_count, copies * lanes)]
-        return Deal(Shares(copies, lanes), backend.lanes(copies * lanes), starts)
+        return Deal(Shares(copies), backend.lanes(copies * lanes), backend.constant(lanes), starts)
 
     def trace(self, tracer: Tracer, run: Callable[[Tracer, Any | None], None]) -> None:
         """Run a kernel on all lanes.
@@ -78,7 +74,7 @@ class Deal:
         for start in self.starts:
             part = tracer.on_lanes(self.lane + start)
             assert part is not None
-            run(part, self.lane // self.shares.lanes)
+            run(part, self.lane // self.lanes_of_a_copy)
 
 
 def threads_in_order(tracer: Tracer) -> int:

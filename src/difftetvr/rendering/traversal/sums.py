@@ -11,25 +11,47 @@ from difftetvr.backend import Backend
 
 
 @dataclass
+class Copies:
+    """Where the copies of a buffer are, in device values: kernels are the same for all lengths of it.
+
+    Attributes:
+        lane: Numbers of the floats of one copy.
+        floats: How many these are.
+        records: How many records.
+    """
+
+    lane: Any
+    floats: Any
+    records: Any
+
+    @staticmethod
+    def of(backend: Backend, floats: int, width: int) -> Copies:
+        """Copies of so many floats, in records of some width."""
+        return Copies(backend.lanes(floats), backend.constant(floats), backend.constant(floats // width))
+
+
+@dataclass
 class Sums:
     """A flat buffer of records.
 
     Attributes:
         buffer: The records of all copies.
-        records: Records of one copy.
-        copy: Which copy each lane adds to; None where there is one for all.
+        copies: Where these are; None where there is one for all.
+        number: Number of them.
+        copy: Which one each lane adds to.
         mode: How additions to one record are reduced.
     """
 
     buffer: Any
-    records: int
+    copies: Copies | None
+    number: int
     copy: Any | None
     mode: dr.ReduceMode
 
     @staticmethod
-    def zeros(backend: Backend, floats: int, records: int, copies: int, mode: dr.ReduceMode) -> Sums:
-        """Nothing yet, so many floats and records in each copy."""
-        return Sums(dr.zeros(backend.Float, copies * floats), records, None, mode)
+    def zeros(backend: Backend, floats: int, copies: Copies | None, number: int, mode: dr.ReduceMode) -> Sums:
+        """Nothing yet, so many floats in each copy."""
+        return Sums(dr.zeros(backend.Float, number * floats), copies, number, None, mode)
 
     def of_copy(self, copy: Any | None) -> Sums:
         """The same for lanes that each add to a copy of their own."""
@@ -37,20 +59,17 @@ class Sums:
 
     def add(self, record: Any, index: Any, active: Any = True) -> None:
         """Add a float or a packet to a record."""
-        if self.copy is not None:
-            index = self.copy * self.records + index
+        if self.copies is not None:
+            index = dr.fma(self.copy, self.copies.records, index)
         dr.scatter_add(self.buffer, record, index, active, mode=self.mode)
 
-    def total(self, lane: Any | None) -> Any:
-        """The sums of all copies, one after the other.
-
-        Args:
-            lane: Numbers of the floats of one copy; None where there is one.
-        """
-        if lane is None:
+    def total(self) -> Any:
+        """The sums of all copies, one after the other."""
+        if self.copies is None:
             return self.buffer
-        real, floats = type(self.buffer), dr.width(lane)
-        total = dr.gather(real, self.buffer, lane)
-        for first in range(floats, dr.width(self.buffer), floats):
-            total += dr.gather(real, self.buffer, lane + first)
+        real, place = type(self.buffer), self.copies.lane
+        total = dr.gather(real, self.buffer, place)
+        for _ in range(1, self.number):
+            place = place + self.copies.floats
+            total += dr.gather(real, self.buffer, place)
         return total
