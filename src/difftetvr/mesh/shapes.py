@@ -200,11 +200,15 @@ class _StarSource:
 
 def _measures(source: _CellSource) -> tuple[Any, Any]:
     """Determinants and qualities of cells, for :func:`difftetvr.recording.replayed`."""
-    a, b, c = source.edges()
-    determinant = _dot(a, _cross(b, c))
-    quality = _quality(determinant, _squared_edges(a, b, c, _sum(a, b, c)))
+    determinant, quality = measured(*source.edges())
     dr.eval(determinant, quality)
     return determinant, quality
+
+
+def measured(a: Vector, b: Vector, c: Vector) -> tuple[Any, Any]:
+    """Determinant and quality of a cell with edges from its first corner, for kernels of others, too."""
+    determinant = _dot(a, _cross(b, c))
+    return determinant, _quality(determinant, _squared_edges(a, b, c, _sum(a, b, c)))
 
 
 def _shapes(source: _CellSource, weigh: Callable[[Any], Any] | None, length: int) -> tuple[Any, Any, Any]:

@@ -8,10 +8,10 @@ from typing import Literal
 import torch
 
 from difftetvr.errors import MeshError
-from difftetvr.mesh import quality
 from difftetvr.mesh.arrays import chunks, true_indices
 from difftetvr.mesh.boundary import BoundaryConstraint, keeps_surface
 from difftetvr.mesh.changes.change import MeshChange, check_indices, with_vertices_kept
+from difftetvr.mesh.changes.collapse_shapes import keeps_shapes
 from difftetvr.mesh.changes.independent import BestFirst
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.mesh.topology.incidence import boundary_vertices, is_corner, stars
@@ -148,7 +148,10 @@ def _choose(
     batch = len(queue) if limit is None else _SMALLEST_BATCH + max(limit, 0) // _CELLS_PER_COLLAPSE
     while len(queue) and within:
         head = queue.take(batch)
-        taken, counts = _choose_among(mesh, candidates.half_edges(head), blocked, min_quality)
+        half_edges = candidates.half_edges(head)
+        keeps, vanishing = keeps_shapes(mesh, half_edges, min_quality)
+        rows = true_indices(keeps)
+        taken, counts = _choose_among(mesh, half_edges.index_select(0, rows), vanishing[rows], blocked)
         if left is not None:
             fits = counts.cumsum(0) <= left
             vanished = int(counts[fits].sum())
@@ -169,7 +172,7 @@ def _next_batch(batch: int, vanished: int, left: int) -> int:
 
 
 def _choose_among(
-    mesh: TetMesh, queue: torch.Tensor, blocked: torch.Tensor, min_quality: float
+    mesh: TetMesh, queue: torch.Tensor, vanishing: torch.Tensor, blocked: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """What taking collapses one by one from the queue would do, and how many cells each of them removes.
 
@@ -177,9 +180,9 @@ def _choose_among(
 
     Args:
         mesh: The mesh.
-        queue: (C, 2) int32, best first.
+        queue: (C, 2) int32, best first; all of them leave good shapes.
+        vanishing: (C,) how many cells each of them removes.
         blocked: (V,) bool, vertices around which cells have changed; updated in place.
-        min_quality: See `collapse_edges`.
 
     Returns:
         (N, 2) int32 collapses, best first, and (N,) counts of cells.
@@ -198,9 +201,8 @@ def _choose_among(
         leads[rank.index_select(0, vertices).long()] = True
         leads[later.long()] = False
         leaders = true_indices(leads)
-        valid, vanishing = _valid(mesh, queue.index_select(0, leaders), min_quality)
-        winners = leaders[valid]
-        removes[winners] = vanishing[valid]
+        winners = leaders[link_condition(mesh.topology, queue.index_select(0, leaders).long())]
+        removes[winners] = vanishing[winners]
         _, around = stars(mesh.topology, removed.index_select(0, winners))
         blocked[mesh.tets.index_select(0, around).view(-1).long()] = True
         pending = pending[~(blocked.index_select(0, vertices) | leads.index_select(0, pending))]
@@ -218,35 +220,6 @@ def _between_candidates(edges: torch.Tensor, rank: torch.Tensor, count: int) -> 
         kept.append(edges[part].index_select(0, rows))
         highest.append(later.index_select(0, rows))
     return torch.cat(kept), torch.cat(highest)
-
-
-def _valid(mesh: TetMesh, half_edges: torch.Tensor, min_quality: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """(N,) bool, which collapses are valid alone, and (N,) how many cells each would remove."""
-    count = half_edges.shape[0]
-    pairs = half_edges.long()
-    owner, cells = stars(mesh.topology, pairs[:, 0])
-    tets = mesh.tets.index_select(0, cells)
-    removed, kept = (column.index_select(0, owner) for column in half_edges.t().contiguous())
-    vanishes = is_corner(tets.t(), kept)
-    stays = true_indices(~vanishes)
-    remaining, kept = tets.index_select(0, stays), kept.index_select(0, stays)[:, None]
-    changed = torch.where(remaining == removed.index_select(0, stays)[:, None], kept, remaining)
-    positions = mesh.vertices.detach().double()
-    worst = _worst(quality.quality(positions, changed), owner.index_select(0, stays), count)
-
-    valid = worst >= max(min_quality, quality.FLAT)
-    doubtful = (worst > quality.FLAT) & ~valid
-    rows = true_indices(doubtful.index_select(0, owner))
-    worst_before = _worst(quality.quality(positions, tets[rows]), owner[rows], count)
-    valid |= doubtful & (worst >= worst_before)
-    indices = true_indices(valid)
-    valid[indices] = link_condition(mesh.topology, pairs[indices])
-    return valid, torch.bincount(owner[true_indices(vanishes)], minlength=count)
-
-
-def _worst(values: torch.Tensor, owner: torch.Tensor, count: int) -> torch.Tensor:
-    largest = torch.full((count,), torch.inf, dtype=values.dtype, device=values.device)
-    return largest.scatter_reduce_(0, owner, values, "amin")
 
 
 def _without_twins(mesh: TetMesh, half_edges: torch.Tensor) -> torch.Tensor:
