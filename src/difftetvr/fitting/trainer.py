@@ -237,7 +237,7 @@ class Trainer:
         )
         if refinement is None:
             return
-        before = judgement.error(mesh, self.parameters.detached_field())
+        before = models[0].error if models else judgement.error(mesh, self.parameters.detached_field())
         self._apply(refinement)
         self.history.refinements.append(
             RefinementRecord(

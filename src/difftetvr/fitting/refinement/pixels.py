@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 from operator import add
 
@@ -15,7 +15,7 @@ from difftetvr.fitting.records.evaluation import Color, true_image
 from difftetvr.mesh.field import Field
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.rendering import Rays, render
-from difftetvr.rendering.gauss_newton import ImageModel, model_image
+from difftetvr.rendering.gauss_newton import Hats, ImageModel, model_image
 from difftetvr.rendering.rays import image_order
 
 _CROSSINGS = 40.0
@@ -40,16 +40,49 @@ class JudgedPixels:
     valid: torch.Tensor | None
     background: Color
 
+    @staticmethod
+    def of(capture: Capture, view: int, background: Color) -> JudgedPixels:
+        """All pixels of a view, in an order in which neighbours see neighbouring cells."""
+        truth = true_image(capture, view, background)
+        rays, order = capture.cameras[view].rays(), image_order(tuple(truth.shape[:2]))
+        parts = [part.expand(*truth.shape).reshape(1, -1, 3) for part in (rays.origins, rays.directions, truth)]
+        valid = None if capture.valid is None else capture.valid[view].reshape(1, -1)
+        pixels = JudgedPixels(Rays(*parts[:2]), parts[2], valid, background)
+        return pixels if order is None else pixels._at(torch.from_numpy(order).long())
+
+    @property
+    def count(self) -> int:
+        """Number N of the pixels."""
+        return self.truth.shape[1]
+
+    def spread(self, count: int, begin: float) -> JudgedPixels:
+        """About as many as are asked for, in equal steps along their order; ``begin`` is in parts of a step."""
+        count = min(count, self.count)
+        return self._at(((torch.arange(count, dtype=torch.float64) + begin) * (self.count / count)).long())
+
+    def _at(self, places: torch.Tensor) -> JudgedPixels:
+        rays = Rays(self.rays.origins[:, places], self.rays.directions[:, places])
+        valid = None if self.valid is None else self.valid[:, places]
+        return JudgedPixels(rays, self.truth[:, places], valid, self.background)
+
     @property
     def _share(self) -> float:
         """Share of the pixels that count, by which means over all pixels are divided; never 0."""
         return 1.0 if self.valid is None else max(float(self.valid.float().mean()), _LEAST_SHARE)
 
-    def model(self, mesh: TetMesh, field: Field, deterministic: bool) -> ImageModel:
-        """Quadratic models of the squared error."""
-        return model_image(
-            mesh, field, self.rays, self.truth, self.background, deterministic=deterministic, valid=self.valid
+    def model(self, mesh: TetMesh, field: Field, deterministic: bool, hats: Hats) -> ImageModel:
+        """Quadratic models of the squared error; what says how great it is counts the valid pixels alone."""
+        model = model_image(
+            mesh,
+            field,
+            self.rays,
+            self.truth,
+            self.background,
+            deterministic=deterministic,
+            valid=self.valid,
+            hats=hats,
         )
+        return replace(model, error=model.error / self._share)
 
     @torch.no_grad()
     def error(self, mesh: TetMesh, field: Field) -> float:
@@ -63,9 +96,16 @@ class JudgedPixels:
 
 @dataclass(frozen=True)
 class Judgement:
-    """What refinements are judged on: views' pixels in one bundle, or a bundle for each where colours depend on it."""
+    """What refinements are judged on.
 
-    parts: list[JudgedPixels]
+    Attributes:
+        every: All pixels of some views. What a vertex is worth is told by all of them: a small cell that no ray crosses
+            would seem to be worth nothing.
+        chosen: Some of them, which what edges and faces would win is told by; None for all.
+    """
+
+    every: list[JudgedPixels]
+    chosen: list[JudgedPixels] | None
 
     @staticmethod
     def of(
@@ -80,37 +120,35 @@ class Judgement:
             background: Linear RGB behind the volume.
             generator: Makes the choice.
         """
+        every = [JudgedPixels.of(capture, view, background) for view in views]
         wanted = max(1, round(_CROSSINGS * mesh.num_cells ** (2 / 3) / len(views)))
-        return Judgement([_pixels_of(capture, view, wanted, background, generator) for view in views])
+        if all(pixels.count <= wanted for pixels in every):
+            return Judgement(every, None)
+        return Judgement(every, [pixels.spread(wanted, generator.random()) for pixels in every])
 
     def together(self) -> Judgement:
-        """All pixels in one bundle."""
-        rays, valid = [part.rays for part in self.parts], [part.valid for part in self.parts]
-        joined = Rays(torch.cat([r.origins for r in rays], 1), torch.cat([r.directions for r in rays], 1))
-        masks = None if valid[0] is None else torch.cat([mask for mask in valid if mask is not None], 1)
-        truth = torch.cat([part.truth for part in self.parts], 1)
-        return Judgement([JudgedPixels(joined, truth, masks, self.parts[0].background)])
+        """The same with all views in one bundle of rays."""
+        return Judgement([_joined(self.every)], None if self.chosen is None else [_joined(self.chosen)])
 
     def model(self, mesh: TetMesh, field: Field, deterministic: bool) -> ImageModel:
-        """Mean over the parts of their quadratic models."""
-        models = (part.model(mesh, field, deterministic) for part in self.parts)
-        return reduce(add, models).scaled(1.0 / len(self.parts))
+        """Quadratic models of the squared error, means over the views."""
+
+        def mean(parts: list[JudgedPixels], hats: Hats) -> ImageModel:
+            models = (part.model(mesh, field, deterministic, hats) for part in parts)
+            return reduce(add, models).scaled(1.0 / len(parts))
+
+        if self.chosen is None:
+            return mean(self.every, "all")
+        return replace(mean(self.chosen, "inner"), vertices=mean(self.every, "vertices").vertices)
 
     def error(self, mesh: TetMesh, field: Field) -> float:
-        """Mean over the parts of their mean squared errors."""
-        return sum(part.error(mesh, field) for part in self.parts) / len(self.parts)
+        """Mean squared error of the chosen pixels, that of the models."""
+        parts = self.chosen or self.every
+        return sum(part.error(mesh, field) for part in parts) / len(parts)
 
 
-def _pixels_of(
-    capture: Capture, view: int, wanted: int, background: Color, generator: np.random.Generator
-) -> JudgedPixels:
-    truth = true_image(capture, view, background)
-    rays, count = capture.cameras[view].rays(), truth.shape[0] * truth.shape[1]
-    # Along a curve through the image, steps of equal length spread over all of it.
-    curve = image_order(tuple(truth.shape[:2]))
-    number = min(wanted, count)
-    places = ((np.arange(number) + generator.random()) * (count / number)).astype(np.int64)
-    chosen = torch.from_numpy(places if curve is None else curve[places].astype(np.int64))
-    origins, directions = (part.expand(*truth.shape).reshape(-1, 3)[chosen] for part in (rays.origins, rays.directions))
-    valid = None if capture.valid is None else capture.valid[view].reshape(-1)[chosen][None]
-    return JudgedPixels(Rays(origins[None], directions[None]), truth.reshape(-1, 3)[chosen][None], valid, background)
+def _joined(parts: list[JudgedPixels]) -> JudgedPixels:
+    rays, masks = [part.rays for part in parts], [part.valid for part in parts if part.valid is not None]
+    origins, directions = (torch.cat([getattr(r, name) for r in rays], 1) for name in ("origins", "directions"))
+    truth = torch.cat([part.truth for part in parts], 1)
+    return JudgedPixels(Rays(origins, directions), truth, torch.cat(masks, 1) if masks else None, parts[0].background)

@@ -15,7 +15,7 @@ from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.mesh.topology.incidence import find_edges, stars
 from difftetvr.mesh.topology.rings import closed_rings
 
-_WIDTH = 10
+_WIDTH = 1
 """Numbers for each flip in the temporaries of a chunk."""
 
 
