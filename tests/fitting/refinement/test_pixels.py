@@ -1,0 +1,98 @@
+"""Pixels that refinements are judged on."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+import difftetvr as dtv
+from difftetvr.capture import Capture
+from difftetvr.fitting.records.evaluation import true_image
+from difftetvr.fitting.refinement import pixels
+from difftetvr.fitting.refinement.pixels import JudgedPixels, Judgement
+from difftetvr.mesh import Field, TetMesh
+from difftetvr.rendering.gauss_newton import model_image
+
+VIEWS = [0, 3, 5]
+BACKGROUND = (0.0, 0.0, 0.0)
+
+
+@pytest.fixture(scope="module")
+def capture() -> Capture:
+    return dtv.VolumeCapture(views=8, width=24, height=20).build()
+
+
+@pytest.fixture(scope="module")
+def scene(capture: Capture) -> tuple[TetMesh, Field]:
+    low, high = capture.bounds.tolist()
+    mesh = TetMesh.grid((4, 3, 5), low, high, dtype=torch.float32)
+    generator = torch.Generator().manual_seed(3)
+    density = 20.0 * torch.rand(mesh.num_vertices, generator=generator)
+    return mesh, Field(torch.rand(mesh.num_vertices, 3, generator=generator), density)
+
+
+def judgement(capture: Capture, mesh: TetMesh) -> Judgement:
+    return Judgement.of(capture, VIEWS, mesh, BACKGROUND, np.random.default_rng(0))
+
+
+def test_all_pixels_of_a_view_are_its_image(capture: Capture) -> None:
+    every = JudgedPixels.of(capture, 2, BACKGROUND)
+    assert every.count == 24 * 20
+    directions = capture.cameras[2].rays().directions.reshape(-1, 3)
+    places = [int((directions == direction).all(1).nonzero()[0]) for direction in every.rays.directions[0]]
+    assert sorted(places) == list(range(24 * 20))
+    assert torch.equal(every.truth[0], true_image(capture, 2, BACKGROUND).reshape(-1, 3)[places])
+
+
+@pytest.mark.parametrize("count", [1, 7, 100, 479, 480, 1000])
+@pytest.mark.parametrize("begin", [0.0, 0.999])
+def test_chosen_pixels_are_different_and_spread(capture: Capture, count: int, begin: float) -> None:
+    every = JudgedPixels.of(capture, 2, BACKGROUND)
+    some = every.spread(count, begin)
+    assert some.count == min(count, every.count)
+    assert len(torch.unique(some.rays.directions[0], dim=0)) == some.count
+
+
+def test_models_are_means_over_the_views(
+    capture: Capture, scene: tuple[TetMesh, Field], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mesh, field = scene
+    monkeypatch.setattr(pixels, "_CROSSINGS", 1e6)
+    judged = judgement(capture, mesh)
+    assert judged.chosen is None
+    images = [model_image(mesh, field, capture.cameras[view], true_image(capture, view)) for view in VIEWS]
+    expected = (images[0] + images[1] + images[2]).scaled(1 / 3)
+    for found in (judged.model(mesh, field, True), judged.together().model(mesh, field, True)):
+        for kind in ("vertices", "edges", "faces"):
+            one, other = getattr(found, kind), getattr(expected, kind)
+            assert float((one.gradient - other.gradient).norm()) <= 1e-3 * float(other.gradient.norm())
+            assert float((one.absorption - other.absorption).norm()) <= 1e-3 * float(other.absorption.norm())
+        assert found.error == pytest.approx(expected.error, rel=1e-4)
+        assert judged.error(mesh, field) == pytest.approx(expected.error, rel=1e-4)
+
+
+def test_vertices_are_judged_on_every_pixel(
+    capture: Capture, scene: tuple[TetMesh, Field], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mesh, field = scene
+    monkeypatch.setattr(pixels, "_CROSSINGS", 3.0)
+    judged = judgement(capture, mesh).together()
+    assert judged.chosen is not None and judged.chosen[0].count < judged.every[0].count
+    found = judged.model(mesh, field, True)
+    expected = judged.every[0].model(mesh, field, True, "vertices").vertices
+    assert torch.equal(found.vertices.emission, expected.emission)
+    assert found.edges.emission.shape == (mesh.topology.edges.shape[0],)
+    assert found.error == pytest.approx(judged.error(mesh, field), rel=1e-4)
+
+
+def test_masked_pixels_have_no_error(capture: Capture, scene: tuple[TetMesh, Field]) -> None:
+    mesh, field = scene
+    spoilt = capture.images.clone()
+    spoilt[:, :, :12] = 7.0
+    valid = torch.ones(8, 20, 24, dtype=torch.bool)
+    valid[:, :, :12] = False
+    masked = replace(capture, images=spoilt, valid=valid)
+    found, half = (judgement(one, mesh).error(mesh, field) for one in (masked, replace(capture, valid=valid)))
+    assert found == pytest.approx(half)
+    assert judgement(masked, mesh).model(mesh, field, True).error == pytest.approx(found, rel=1e-4)
