@@ -243,29 +243,9 @@ def test_float32_and_one_thread_agree():
         assert (single.absorption - double.absorption).norm() <= 1e-3 * double.absorption.norm()
 
 
-@pytest.mark.parametrize("where", [OUTSIDE, INSIDE])
-def test_hats_by_themselves(where):
-    mesh, field, truth = random_scene()
-    every, vertices, inner = (
-        model_image(mesh, field, camera_at(where), truth, BACKGROUND, deterministic=True, hats=hats)
-        for hats in ("all", "vertices", "inner")
-    )
-    assert every.error == vertices.error == inner.error
-    for name in ("gradient", "emission", "coupling", "absorption", "weight"):
-        for kind, alone, other in (
-            ("vertices", vertices, inner),
-            ("edges", inner, vertices),
-            ("faces", inner, vertices),
-        ):
-            assert torch.equal(getattr(getattr(every, kind), name), getattr(getattr(alone, kind), name))
-            assert not len(getattr(getattr(other, kind), name))
-
-
 def test_what_is_refused():
     mesh, field, truth = random_scene()
     per_cell = dtv.Field(torch.rand(mesh.num_cells, 3), torch.rand(mesh.num_cells))
-    with pytest.raises(DiffTetError, match=r"hats is 'edges'; pass one of all, vertices, inner\."):
-        model_image(mesh, field, camera_at(OUTSIDE), truth, hats="edges")
     with pytest.raises(MeshError, match="lives on cells"):
         model_image(mesh, per_cell, camera_at(OUTSIDE), truth)
     with pytest.raises(DiffTetError, match=r"shape \(48, 48, 3\); the camera takes \(30, 30, 3\)"):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Literal, get_args
 
 import torch
 
@@ -15,12 +14,10 @@ from difftetvr.mesh import Field, TetMesh
 from difftetvr.rendering.api import as_background
 from difftetvr.rendering.kernels.composition import Composition
 from difftetvr.rendering.kernels.forward import render_forward
-from difftetvr.rendering.kernels.hats import RECORD, HatImage, WantedHats, hat_records
+from difftetvr.rendering.kernels.hats import RECORD, HatImage, hat_records
 from difftetvr.rendering.kernels.shares import threads_in_order
 from difftetvr.rendering.preparation import ViewOptions, prepare_view
 from difftetvr.rendering.rays import Rays, RaySource
-
-Hats = Literal["all", "vertices", "inner"]
 
 _TINY = 1e-30
 
@@ -159,7 +156,6 @@ def model_image(
     transmittance_threshold: float = 1e-4,
     deterministic: bool = False,
     valid: torch.Tensor | None = None,
-    hats: Hats = "all",
 ) -> ImageModel:
     """Renders a view, and predicts what changes of the mesh would do to its squared error.
 
@@ -175,10 +171,9 @@ def model_image(
         transmittance_threshold: Rays stop once their transmittance is at or below this value.
         deterministic: Whether sums are the same in every run to the last bit, see :func:`difftetvr.render`.
         valid: (H, W) bool, pixels that have an error; None: all. The curvature counts all of them.
-        hats: What is wanted: ``"vertices"`` take a quarter of the time of ``"all"``, ``"inner"`` are edges and faces.
 
     Returns:
-        The model, in the precision and on the device of the mesh; there are no hats of what is not wanted.
+        The model, in the precision and on the device of the mesh.
 
     Raises:
         MeshError: The field does not fit the mesh, lives on cells, or holds invalid values.
@@ -190,8 +185,6 @@ def model_image(
     view = prepare_view(mesh, field, camera, options)
     if view.task.content != "vertex":
         raise MeshError("The field lives on cells; hat functions need colours and densities on vertices.")
-    if hats not in get_args(Hats):
-        raise DiffTetError(f"hats is {shown(hats)}; pass one of {', '.join(get_args(Hats))}.")
     truth = as_reals(truth, "The true image", DiffTetError)
     if len(view.shape) != 2 or truth.shape != (*view.shape, 3):
         wanted = f"takes {(*view.shape, 3)}" if len(view.shape) == 2 else f"sees {view.shape}, which is no image"
@@ -216,16 +209,15 @@ def model_image(
             mesh,
             view.upload.order,
             HatImage(backend.floats(image), backend.floats(curvature * residual)),
-            WantedHats(hats != "inner", hats != "vertices", deterministic),
+            deterministic,
         )
-        found = [residual.new_zeros(0, RECORD) for _ in range(3)]
-        if records.vertices is not None:
-            rows = backend.tensor(records.vertices, -1, RECORD)[: mesh.num_vertices]
-            # They were numbered in the order of memory.
-            found[0] = torch.empty_like(rows).index_copy_(0, view.upload.order.vertices.long(), rows)
-        if records.edges is not None and records.faces is not None:
-            found[1] = backend.tensor(records.edges, -1, RECORD)[: mesh.topology.edges.shape[0]]
-            found[2] = backend.tensor(records.faces, -1, RECORD)[: mesh.topology.faces.shape[0]]
+        counts = (mesh.num_vertices, mesh.topology.edges.shape[0], mesh.topology.faces.shape[0])
+        found = [
+            backend.tensor(buffer).reshape(-1, RECORD)[:count]
+            for buffer, count in zip((records.vertices, records.edges, records.faces), counts, strict=True)
+        ]
+    # Vertices were numbered in the order of memory.
+    found[0] = torch.empty_like(found[0]).index_copy_(0, view.upload.order.vertices.long(), found[0])
     vertices, edges, faces = (_derivatives(rows, curvature).with_density_unit(view.unit) for rows in found)
     return ImageModel(vertices, edges, faces, float(residual.square().mean()))
 

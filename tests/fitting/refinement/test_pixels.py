@@ -60,7 +60,7 @@ def test_models_are_means_over_the_views(
     mesh, field = scene
     monkeypatch.setattr(pixels, "_CROSSINGS", 1e6)
     judged = judgement(capture, mesh)
-    assert judged.chosen is None
+    assert [part.count for part in judged.parts] == [24 * 20] * len(VIEWS)
     images = [model_image(mesh, field, capture.cameras[view], true_image(capture, view)) for view in VIEWS]
     expected = (images[0] + images[1] + images[2]).scaled(1 / 3)
     for found in (judged.model(mesh, field, True), judged.together().model(mesh, field, True)):
@@ -72,18 +72,17 @@ def test_models_are_means_over_the_views(
         assert judged.error(mesh, field) == pytest.approx(expected.error, rel=1e-4)
 
 
-def test_vertices_are_judged_on_every_pixel(
+def test_no_more_pixels_than_the_cells_need(
     capture: Capture, scene: tuple[TetMesh, Field], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     mesh, field = scene
     monkeypatch.setattr(pixels, "_CROSSINGS", 3.0)
-    judged = judgement(capture, mesh).together()
-    assert judged.chosen is not None and judged.chosen[0].count < judged.every[0].count
-    found = judged.model(mesh, field, True)
-    expected = judged.every[0].model(mesh, field, True, "vertices").vertices
-    assert torch.equal(found.vertices.emission, expected.emission)
-    assert found.edges.emission.shape == (mesh.topology.edges.shape[0],)
-    assert found.error == pytest.approx(judged.error(mesh, field), rel=1e-4)
+    judged = judgement(capture, mesh)
+    wanted = 3.0 * mesh.num_cells ** (2 / 3) / len(VIEWS)
+    assert [part.count for part in judged.parts] == [round(wanted)] * len(VIEWS)
+    assert round(wanted) < 24 * 20
+    model = judged.together().model(mesh, field, True)
+    assert model.error == pytest.approx(judged.error(mesh, field), rel=1e-4)
 
 
 def test_masked_pixels_have_no_error(capture: Capture, scene: tuple[TetMesh, Field]) -> None:

@@ -87,25 +87,24 @@ class HatImage:
 
 @dataclass
 class HatRecords:
-    """Flat arrays of ``RECORD`` floats for each vertex, edge and face; None for what is not wanted."""
+    """Flat arrays of ``RECORD`` floats for each vertex, edge and face."""
 
-    vertices: Any | None
-    edges: Any | None
-    faces: Any | None
+    vertices: Any
+    edges: Any
+    faces: Any
 
 
 @dataclass
 class _HatSums:
-    """What the kernel adds to to make them; None for what is not wanted."""
+    """What the kernel adds to to make them."""
 
-    vertices: Sums | None
-    edges: Sums | None
-    faces: Sums | None
+    vertices: Sums
+    edges: Sums
+    faces: Sums
 
     def of_copy(self, copy: Any | None) -> _HatSums:
         """The same for lanes that each add to a copy of their own."""
-        parts = (self.vertices, self.edges, self.faces)
-        return _HatSums(*(None if sums is None else sums.of_copy(copy) for sums in parts))
+        return _HatSums(*(sums.of_copy(copy) for sums in (self.vertices, self.edges, self.faces)))
 
 
 @dataclass
@@ -150,19 +149,9 @@ class _Samples:
         return total
 
 
-@dataclass(frozen=True)
-class WantedHats:
-    """What records are wanted of, and whether sums over rays have a certain order.
-
-    See :mod:`difftetvr.rendering.kernels.shares` for the order.
-    """
-
-    vertices: bool = True
-    edges_and_faces: bool = True
-    in_order: bool = False
-
-
-def hat_records(tracer: Tracer, mesh: TetMesh, order: MemoryOrder, image: HatImage, wanted: WantedHats) -> HatRecords:
+def hat_records(
+    tracer: Tracer, mesh: TetMesh, order: MemoryOrder, image: HatImage, in_order: bool = False
+) -> HatRecords:
     """Sums over the rays of a view for every vertex, edge and face.
 
     Args:
@@ -170,16 +159,12 @@ def hat_records(tracer: Tracer, mesh: TetMesh, order: MemoryOrder, image: HatIma
         mesh: The mesh that is seen.
         order: Its order in memory, which is that of the records of vertices; edges and faces are in the mesh's.
         image: The rendered image, and the derivative of the loss with respect to it.
-        wanted: What is wanted.
+        in_order: Whether sums over rays have a certain order, see :mod:`difftetvr.rendering.kernels.shares`.
     """
-    view, deal = tracer.view, Deal.of(tracer, wanted.in_order)
-    counts = [few_lengths(mesh.num_vertices) if wanted.vertices else 0, 0, 0]
-    if wanted.edges_and_faces:
-        counts[1:] = (few_lengths(table.shape[0]) for table in (mesh.topology.edges, mesh.topology.faces))
+    view, topology, deal = tracer.view, mesh.topology, Deal.of(tracer, in_order)
+    counts = [few_lengths(n) for n in (mesh.num_vertices, topology.edges.shape[0], topology.faces.shape[0])]
     mode = reduce_mode(view, RECORD * sum(counts), deal.shares)
-    copies = [
-        None if deal.lane is None or not count else Copies.of(view.backend, RECORD * count, RECORD) for count in counts
-    ]
+    copies = [None if deal.lane is None else Copies.of(view.backend, RECORD * count, RECORD) for count in counts]
     records: HatRecords = replayed(
         _records, tracer, HatTables.of(view, mesh, order), image, deal, _Buffers(counts, mode, copies)
     )
@@ -188,7 +173,7 @@ def hat_records(tracer: Tracer, mesh: TetMesh, order: MemoryOrder, image: HatIma
 
 @dataclass
 class _Buffers:
-    """Numbers of records, 0 where none are wanted, how additions are reduced, and where copies are."""
+    """Numbers of records, how additions are reduced, and where copies are; None where there is but one."""
 
     counts: list[int]
     mode: dr.ReduceMode
@@ -198,16 +183,14 @@ class _Buffers:
 def _records(tracer: Tracer, tables: HatTables, image: HatImage, deal: Deal, buffers: _Buffers) -> HatRecords:
     backend, number = tracer.view.backend, deal.shares.copies
     pairs = zip(buffers.counts, buffers.copies, strict=True)
-    parts = [
-        Sums.zeros(backend, RECORD * count, copies, number, buffers.mode) if count else None for count, copies in pairs
-    ]
+    parts = [Sums.zeros(backend, RECORD * count, copies, number, buffers.mode) for count, copies in pairs]
     sums = _HatSums(*parts)
 
     def run(part: Tracer, copy: Any | None) -> None:
         part.trace(lambda rays: _HatKernel(part, rays, tables, sums.of_copy(copy), image))
 
     deal.trace(tracer, run)
-    totals = HatRecords(*(None if part is None else part.total() for part in parts))
+    totals = HatRecords(*(part.total() for part in parts))
     dr.eval(totals)
     return totals
 
@@ -225,26 +208,23 @@ class _HatKernel:
         )
 
     def start(self) -> HatRay:
-        lanes, carried = dr.width(self.rays.pixel), 3 if self.records.edges is not None else 0
+        lanes = dr.width(self.rays.pixel)
         return HatRay(
             dr.ones(self.view.backend.Float, lanes),
             self.color,
-            [self._no_response() for _ in range(carried)],
-            [dr.full(self.view.backend.UInt, _UNKNOWN, lanes) for _ in range(carried)],
-            self._no_response() if self.records.faces is not None else [],
+            [self._no_response() for _ in range(3)],
+            [dr.full(self.view.backend.UInt, _UNKNOWN, lanes) for _ in range(3)],
+            self._no_response(),
         )
 
     def read(self, vertex: Any, active: Any) -> Corner:
         position, attributes = read_vertex(self.view, vertex, active)
         attributes = [*attributes, *read_channels(self.view, vertex, active)]
-        return corner_of(self.rays.frame, vertex, position, attributes, 4 if self.records.vertices is not None else 0)
+        return corner_of(self.rays.frame, vertex, position, attributes, 4)
 
     def visit(self, step: Step, ray: HatRay) -> HatRay:
         samples, transmittance, rest = self._sample(step, ray)
-        if self.records.vertices is not None:
-            self._finish_vertices(step, samples)
-        if self.records.edges is None:
-            return HatRay(transmittance, rest, ray.edges, ray.edge_ids, ray.face)
+        self._finish_vertices(step, samples)
         vertices = [*_turned(step.exit, [corner.vertex for corner in step.face.corners]), step.apex.vertex]
         cell = _RankedCell(self.tables, step.cell, _ranks(vertices))
         edges, edge_ids = self._finish_edges(step.exit, ray, samples, cell)
@@ -254,7 +234,7 @@ class _HatKernel:
         return ray.transmittance > self.view.threshold
 
     def leave(self, face: Face, ray: HatRay, active: Any) -> HatRay:
-        for corner in face.corners if self.records.vertices is not None else ():
+        for corner in face.corners:
             self._scatter(self.records.vertices, corner.vertex, corner.adjoints, active)
         for edge, response in zip(ray.edge_ids, ray.edges, strict=True):
             self._scatter(self.records.edges, edge, response, active & (edge != _UNKNOWN))
@@ -327,8 +307,7 @@ class _HatKernel:
             self._scatter(self.records.faces, cell.face(opposite), samples.respond(_DROPPED, other, _APEX), True)
         return samples.respond(_AFTER, _BEFORE, _APEX)
 
-    def _scatter(self, sums: Sums | None, index: Any, response: Response, active: Any) -> None:
-        assert sums is not None
+    def _scatter(self, sums: Sums, index: Any, response: Response, active: Any) -> None:
         b, d, g = response[0], response[1:], self.gradient
         zero = dr.zeros_like(b)
         slope = dr.fma(g[0], d[0], dr.fma(g[1], d[1], g[2] * d[2]))
