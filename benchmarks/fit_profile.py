@@ -39,6 +39,7 @@ PARTS: dict[str, tuple[Any, str]] = {
     "order in memory": (memory_order, "_ordered"),
     "models of images": (Judgement, "model"),
     "flips": (exchange_round._Round, "flip"),
+    "search for flips": (exchange_round, "find_flips"),
     "collapses": (exchange_round._Round, "collapse"),
     "bisections": (exchange_round._Round, "bisect"),
     "what edges win": (exchange_round, "bisection_gains"),

@@ -225,19 +225,22 @@ class Trainer:
         if self.strategy is None or not self.strategy.is_due(self._moment()):
             return
         judgement, mesh = self._judgement(self.strategy.views), self.mesh
-        models: list[ImageModel] = []
 
-        def model() -> ImageModel:
-            models.append(judgement.model(mesh, self.parameters.detached_field(), self.config.deterministic))
-            return models[0].with_density_unit(self.capture.density_unit)
+        unit = self.capture.density_unit
 
-        values = self.parameters.values(self.capture.density_unit)
+        def model(face_steps: torch.Tensor | None) -> ImageModel:
+            steps = None if face_steps is None else face_steps * face_steps.new_tensor([1.0, 1.0, 1.0, unit])
+            field, deterministic = self.parameters.detached_field(), self.config.deterministic
+            return judgement.model(mesh, field, deterministic, steps).with_density_unit(unit)
+
+        values = self.parameters.values(unit)
         refinement = self.strategy.refine(
             Situation(mesh, values, self._moment(), model, self._color_gradients, self._free_space)
         )
         if refinement is None:
             return
-        before = models[0].error if models else judgement.error(mesh, self.parameters.detached_field())
+        judges = judgement.some()
+        before = judges.error(mesh, self.parameters.detached_field())
         self._apply(refinement)
         self.history.refinements.append(
             RefinementRecord(
@@ -250,7 +253,7 @@ class Trainer:
                 flipped=refinement.flipped,
                 predicted=refinement.predicted,
                 error_before=before,
-                error_after=judgement.error(self.mesh, self.parameters.detached_field()),
+                error_after=judges.error(self.mesh, self.parameters.detached_field()),
             )
         )
 

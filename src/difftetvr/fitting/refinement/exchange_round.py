@@ -11,6 +11,7 @@ from difftetvr.fitting.refinement.gains import (
     bisection_gains,
     collapse_costs,
     edges_before,
+    face_steps,
     flip_gains,
 )
 from difftetvr.fitting.refinement.strategy import Refinement, Situation
@@ -20,7 +21,7 @@ from difftetvr.mesh.changes.bisection import bisect_edges, independent_edges, lo
 from difftetvr.mesh.changes.change import MeshChange
 from difftetvr.mesh.changes.collapse import collapse_edges
 from difftetvr.mesh.changes.flip_search import find_flips
-from difftetvr.mesh.changes.flips import THREE_TO_TWO, TWO_TO_THREE, apply_flips, independent_flips
+from difftetvr.mesh.changes.flips import THREE_TO_TWO, TWO_TO_THREE, Flips, apply_flips, independent_flips
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.mesh.topology.incidence import cell_edges, cells_per_edge, find_edges
 from difftetvr.rendering.gauss_newton import ImageModel
@@ -40,10 +41,14 @@ def exchange_cells(situation: Situation, target: int, options: Exchange) -> Refi
         target: Cells afterwards.
         options: How much of what.
     """
-    model = situation.model()
+    mesh = situation.mesh
+    flips = find_flips(mesh, min_quality=options.min_quality) if options.flips else None
+    # What is known of faces is what the flips that they allow would win; without flips, nothing.
+    none = situation.values.new_zeros((mesh.topology.faces.shape[0], 4))
+    model = situation.model(none if flips is None else face_steps(flips, situation.values))
     exchange = _Round(situation, model, options)
-    if options.flips:
-        exchange.flip(model, target, options)
+    if flips is not None:
+        exchange.flip(flips, model, target, options)
     if options.share:
         exchange.collapse(model, options)
     exchange.bisect(target, options)
@@ -64,9 +69,8 @@ class _Round:
         self.predicted = 0.0
         self.flipped = 0
 
-    def flip(self, model: ImageModel, target: int, options: Exchange) -> None:
+    def flip(self, flips: Flips, model: ImageModel, target: int, options: Exchange) -> None:
         """Cut the same space otherwise where that fits the images better."""
-        flips = find_flips(self.mesh, min_quality=options.min_quality)
         # A 2-3 flip makes a cell more, a 3-2 flip one less: one that a bisection could use.
         cells = torch.where(flips.kind == TWO_TO_THREE, 1, torch.where(flips.kind == THREE_TO_TWO, -1, 0))
         gain = flip_gains(flips, self.values, model) - self._price_of_a_cell(options) * cells

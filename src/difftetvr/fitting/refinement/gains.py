@@ -144,17 +144,39 @@ def flip_gains(flips: Flips, values: torch.Tensor, model: ImageModel) -> torch.T
     topology, surplus = flips.mesh.topology, flips.surplus(values)
     gain = torch.zeros_like(surplus[:, 0])
     by_face = true_indices(flips.kind == TWO_TO_THREE)
-    first = flips.cells[by_face, 0].long()
-    corners = topology.tets[first]
-    # The vanishing face lies opposite the end of the new edge that is a corner of the first cell.
-    opposite = (corners[:, :, None] == flips.edge[by_face, None, :]).any(2).int().argmax(1)
-    faces = cell_faces(topology)[first, opposite].long()
-    gain[by_face] = model.faces[faces].decrease(surplus[by_face])
+    faces = _vanishing_faces(flips, by_face)
+    if model.faces is None:
+        assert model.face_steps is not None
+        gain[by_face] = model.face_steps.decrease()[faces]
+    else:
+        gain[by_face] = model.faces[faces].decrease(surplus[by_face])
     by_edge = true_indices(flips.kind != TWO_TO_THREE)
     is_ring = (flips.kind[by_edge] == FOUR_TO_FOUR)[:, None]
     ends = torch.where(is_ring, flips.ring[by_edge][:, [0, 2]], flips.edge[by_edge])
     gain[by_edge] = model.edges[find_edges(topology, ends.long())].decrease(surplus[by_edge])
     return gain
+
+
+def face_steps(flips: Flips, values: torch.Tensor) -> torch.Tensor:
+    """(F, 4) what flips add to the hats of the faces that they take away; 0 for all other faces.
+
+    Args:
+        flips: All possible flips of a mesh.
+        values: (V, 4) parameters.
+    """
+    by_face = true_indices(flips.kind == TWO_TO_THREE)
+    steps = values.new_zeros((flips.mesh.topology.faces.shape[0], 4))
+    steps[_vanishing_faces(flips, by_face)] = flips.select(by_face).surplus(values)
+    return steps
+
+
+def _vanishing_faces(flips: Flips, rows: torch.Tensor) -> torch.Tensor:
+    """(N,) indices into ``topology.faces`` of the faces that 2-3 flips take away; ``rows`` says which flips."""
+    topology = flips.mesh.topology
+    first = flips.cells[rows, 0].long()
+    # The vanishing face lies opposite the end of the new edge that is a corner of the first cell.
+    opposite = (topology.tets[first][:, :, None] == flips.edge[rows, None, :]).any(2).int().argmax(1)
+    return cell_faces(topology)[first, opposite].long()
 
 
 def edges_before(topology: Topology, change: MeshChange) -> torch.Tensor:

@@ -70,10 +70,19 @@ class JudgedPixels:
         """Share of the pixels that count, by which means over all pixels are divided; never 0."""
         return 1.0 if self.valid is None else max(float(self.valid.float().mean()), _LEAST_SHARE)
 
-    def model(self, mesh: TetMesh, field: Field, deterministic: bool) -> ImageModel:
+    def model(
+        self, mesh: TetMesh, field: Field, deterministic: bool, face_steps: torch.Tensor | None = None
+    ) -> ImageModel:
         """Quadratic models of the squared error; what says how great it is counts the valid pixels alone."""
         model = model_image(
-            mesh, field, self.rays, self.truth, self.background, deterministic=deterministic, valid=self.valid
+            mesh,
+            field,
+            self.rays,
+            self.truth,
+            self.background,
+            deterministic=deterministic,
+            valid=self.valid,
+            face_steps=face_steps,
         )
         return replace(model, error=model.error / self._share)
 
@@ -114,13 +123,19 @@ class Judgement:
         """The same with all views in one bundle of rays."""
         return Judgement([_joined(self.parts)])
 
-    def model(self, mesh: TetMesh, field: Field, deterministic: bool) -> ImageModel:
-        """Quadratic models of the squared error, means over the views."""
-        models = (part.model(mesh, field, deterministic) for part in self.parts)
+    def some(self) -> Judgement:
+        """An eighth of the pixels: enough to see what became of the error."""
+        return Judgement([part.spread(max(1, part.count // 8), 0.5) for part in self.parts])
+
+    def model(
+        self, mesh: TetMesh, field: Field, deterministic: bool, face_steps: torch.Tensor | None = None
+    ) -> ImageModel:
+        """Quadratic models of the squared error, means over the views; see `model_image` for the steps."""
+        models = (part.model(mesh, field, deterministic, face_steps) for part in self.parts)
         return reduce(add, models).scaled(1.0 / len(self.parts))
 
     def error(self, mesh: TetMesh, field: Field) -> float:
-        """Mean squared error, that of the models."""
+        """Mean squared error."""
         return sum(part.error(mesh, field) for part in self.parts) / len(self.parts)
 
 

@@ -48,7 +48,7 @@ class Situation:
         values: (V, 4) parameters of its vertices: linear RGB in [0, 1], and density in units of the capture's.
         moment: Where the run stands.
         model: The mean over some random training views of the squared error and its quadratic models, in the units of
-            ``values``.
+            ``values``. It takes None, or (F, 4) the only step of each face's hat that is of interest, in these units.
         color_gradients: The sum over all training views of the absolute derivatives of the loss with respect to
             each vertex's colour, (V,).
         free_space: Where densities stay 0.
@@ -57,7 +57,7 @@ class Situation:
     mesh: TetMesh
     values: torch.Tensor
     moment: Moment
-    model: Callable[[], ImageModel]
+    model: Callable[[torch.Tensor | None], ImageModel]
     color_gradients: Callable[[], torch.Tensor]
     free_space: FreeSpace
 

@@ -46,6 +46,9 @@ from difftetvr.rendering.traversal.walk import Corner, Exit, Face
 RECORD = 12
 """Floats a hat: colour gradient (3), density gradient, sums of B^2, B D (3), D^2, B, and two of padding."""
 
+STEP_RECORD = 2
+"""Floats a step: derivative of the error, and sum of the squared responses."""
+
 _SAMPLES = 4
 """Pieces of a crossing on which hats, colour and density are taken as constant."""
 
@@ -79,15 +82,22 @@ class HatTables:
 
 @dataclass
 class HatImage:
-    """What the kernel reads of each pixel, flat: (H, W, 3) radiance over the background, and the loss's derivative."""
+    """What the kernel reads, flat.
+
+    Attributes:
+        color: (H, W, 3) radiance over the background.
+        gradient: (H, W, 3) derivative of the loss with respect to it.
+        face_steps: (F, 4) the one step that is looked at of each face; None for all.
+    """
 
     color: Any
     gradient: Any
+    face_steps: Any | None = None
 
 
 @dataclass
 class HatRecords:
-    """Flat arrays of ``RECORD`` floats for each vertex, edge and face."""
+    """Flat arrays of ``RECORD`` floats for each vertex, edge and face, or ``STEP_RECORD`` for each face."""
 
     vertices: Any
     edges: Any
@@ -163,27 +173,32 @@ def hat_records(
     """
     view, topology, deal = tracer.view, mesh.topology, Deal.of(tracer, in_order)
     counts = [few_lengths(n) for n in (mesh.num_vertices, topology.edges.shape[0], topology.faces.shape[0])]
-    mode = reduce_mode(view, RECORD * sum(counts), deal.shares)
-    copies = [None if deal.lane is None else Copies.of(view.backend, RECORD * count, RECORD) for count in counts]
+    widths = [RECORD, RECORD, RECORD if image.face_steps is None else STEP_RECORD]
+    sizes = [count * width for count, width in zip(counts, widths, strict=True)]
+    mode = reduce_mode(view, sum(sizes), deal.shares)
+    copies = [
+        None if deal.lane is None else Copies.of(view.backend, size, width)
+        for size, width in zip(sizes, widths, strict=True)
+    ]
     records: HatRecords = replayed(
-        _records, tracer, HatTables.of(view, mesh, order), image, deal, _Buffers(counts, mode, copies)
+        _records, tracer, HatTables.of(view, mesh, order), image, deal, _Buffers(sizes, mode, copies)
     )
     return records
 
 
 @dataclass
 class _Buffers:
-    """Numbers of records, how additions are reduced, and where copies are; None where there is but one."""
+    """Numbers of floats, how additions are reduced, and where copies are; None where there is but one."""
 
-    counts: list[int]
+    sizes: list[int]
     mode: dr.ReduceMode
     copies: list[Copies | None]
 
 
 def _records(tracer: Tracer, tables: HatTables, image: HatImage, deal: Deal, buffers: _Buffers) -> HatRecords:
     backend, number = tracer.view.backend, deal.shares.copies
-    pairs = zip(buffers.counts, buffers.copies, strict=True)
-    parts = [Sums.zeros(backend, RECORD * count, copies, number, buffers.mode) for count, copies in pairs]
+    pairs = zip(buffers.sizes, buffers.copies, strict=True)
+    parts = [Sums.zeros(backend, size, copies, number, buffers.mode) for size, copies in pairs]
     sums = _HatSums(*parts)
 
     def run(part: Tracer, copy: Any | None) -> None:
@@ -200,7 +215,7 @@ class _HatKernel:
 
     def __init__(self, tracer: Tracer, rays: Lanes, tables: HatTables, records: _HatSums, image: HatImage) -> None:
         self.view, self.rays, self.tables, self.records = tracer.view, rays, tables, records
-        self.span = Span.of(tracer, rays)
+        self.span, self.face_steps = Span.of(tracer, rays), image.face_steps
         pixel, valid = rays.pixel, rays.valid
         self.color, self.gradient = (
             [dr.gather(self.view.backend.Float, array, 3 * pixel + k, valid) for k in range(3)]
@@ -302,10 +317,23 @@ class _HatKernel:
     def _finish_faces(self, ray: HatRay, samples: _Samples, cell: _RankedCell) -> Response:
         """Scatter the face entered through and the two passed by; returns the response of the face left through."""
         entered = _plus(ray.face, samples.respond(_DROPPED, _AFTER, _BEFORE))
-        self._scatter(self.records.faces, cell.face(_APEX), entered, True)
+        self._scatter_face(cell.face(_APEX), entered)
         for opposite, other in ((_BEFORE, _AFTER), (_AFTER, _BEFORE)):
-            self._scatter(self.records.faces, cell.face(opposite), samples.respond(_DROPPED, other, _APEX), True)
+            self._scatter_face(cell.face(opposite), samples.respond(_DROPPED, other, _APEX))
         return samples.respond(_AFTER, _BEFORE, _APEX)
+
+    def _scatter_face(self, face: Any, response: Response) -> None:
+        if self.face_steps is None:
+            self._scatter(self.records.faces, face, response, True)
+            return
+        *color, density = dr.gather(self.view.backend.Float4, self.face_steps, face)
+        changes = [dr.fma(response[0], c, d * density) for c, d in zip(color, response[1:], strict=True)]
+        slope, square = (
+            dr.fma(one[0], changes[0], dr.fma(one[1], changes[1], one[2] * changes[2]))
+            for one in (self.gradient, changes)
+        )
+        is_asked = (density != 0) | (color[0] != 0) | (color[1] != 0) | (color[2] != 0)
+        self.records.faces.add(self.view.backend.Floats([slope, square]), face, is_asked)
 
     def _scatter(self, sums: Sums, index: Any, response: Response, active: Any) -> None:
         b, d, g = response[0], response[1:], self.gradient
