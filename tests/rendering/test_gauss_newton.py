@@ -246,6 +246,8 @@ def test_float32_and_one_thread_agree():
 def test_what_is_refused():
     mesh, field, truth = random_scene()
     per_cell = dtv.Field(torch.rand(mesh.num_cells, 3), torch.rand(mesh.num_cells))
+    with pytest.raises(DiffTetError, match=r"face_steps has shape \(3, 4\); this mesh takes \(\d+, 4\)\."):
+        model_image(mesh, field, camera_at(OUTSIDE), truth, face_steps=torch.zeros(3, 4))
     with pytest.raises(MeshError, match="lives on cells"):
         model_image(mesh, per_cell, camera_at(OUTSIDE), truth)
     with pytest.raises(DiffTetError, match=r"shape \(48, 48, 3\); the camera takes \(30, 30, 3\)"):

@@ -8,7 +8,7 @@ import torch
 from difftetvr.capture.free_space import FreeSpace
 from difftetvr.errors import FitError
 from difftetvr.fitting.refinement import Exchange, Grow, Moment, Situation, Star
-from difftetvr.fitting.refinement.gains import bisection_gains, collapse_costs, edges_before, flip_gains
+from difftetvr.fitting.refinement.gains import bisection_gains, collapse_costs, edges_before, face_steps, flip_gains
 from difftetvr.mesh import Field, TetMesh, bisect_edges, collapse_edges
 from difftetvr.mesh.changes.flip_search import find_flips
 from difftetvr.mesh.changes.flips import apply_flips
@@ -62,7 +62,7 @@ def situation_of(scene, budget=None, iteration=100, free_space=NOWHERE):
     mesh, values, _, model = scene
     moment = Moment(iteration, 1000, 10, mesh.num_cells, budget or mesh.num_cells)
     gradients = torch.linspace(0, 1, mesh.num_vertices)
-    return Situation(mesh, values, moment, lambda: model, lambda: gradients, free_space)
+    return Situation(mesh, values, moment, lambda face_steps: model, lambda: gradients, free_space)
 
 
 def everything(mesh):
@@ -144,6 +144,19 @@ def test_collapse_costs_are_those_of_the_values_after_a_real_collapse(scene):
         assert float(costs.cost[row]) >= least * (1 - 1e-6) - 1e-15, "the bends between the new cells cost more"
         assert mesh.num_cells - change.mesh.num_cells == int(costs.cells[row])
     assert tried > 15
+
+
+def test_flips_gain_the_same_by_the_one_step_that_is_asked_for(scene):
+    mesh, values, truth, model = scene
+    flips = find_flips(mesh)
+    steps = face_steps(flips, values)
+    assert 0 < int(steps.any(1).sum()) < len(steps)
+    asked = model_image(mesh, field_of(values), CAMERA, truth, transmittance_threshold=0.0, face_steps=steps)
+    assert asked.faces is None
+    expected = flip_gains(flips, values, model)
+    torch.testing.assert_close(flip_gains(flips, values, asked), expected, rtol=1e-9, atol=1e-9 * float(expected.max()))
+    both = (asked + asked).scaled(0.5).with_density_unit(3.0)
+    torch.testing.assert_close(both.face_steps.decrease(), asked.face_steps.decrease())
 
 
 def test_where_all_else_is_linear_a_collapse_costs_the_vertex_s_own_deviation(scene):

@@ -21,20 +21,17 @@ from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
-import torch
 
 from difftetvr.mesh import TetMesh
-from difftetvr.mesh.topology.incidence import cell_edges, cell_faces
-from difftetvr.mesh.topology.topology import LOCAL_EDGE_OF, LOCAL_EDGES, Topology
 from difftetvr.recording import few_lengths, replayed
 from difftetvr.rendering.kernels.gradients import reduce_mode
+from difftetvr.rendering.kernels.hat_tables import HatTables, RankedCell, ranks_of
 from difftetvr.rendering.kernels.shares import Deal
 from difftetvr.rendering.search.memory_order import MemoryOrder
 from difftetvr.rendering.traversal.crossing import (
     Span,
     Step,
     Tracer,
-    View,
     corner_of,
     read_channels,
     read_vertex,
@@ -59,25 +56,6 @@ _UNKNOWN = 0xFFFFFFFF
 _DROPPED, _AFTER, _BEFORE, _APEX = range(4)
 
 Response = list[Any]  # B, D_r, D_g, D_b
-
-
-@dataclass
-class HatTables:
-    """Flat tables from a cell to its edges and faces, both in the order of its vertices' indices.
-
-    Attributes:
-        edges: (T, 6) indices into ``topology.edges``; pairs of ranks in the order of ``LOCAL_EDGES``.
-        faces: (T, 4) indices into ``topology.faces``; entry r is the face opposite the r-th vertex.
-    """
-
-    edges: Any
-    faces: Any
-
-    @staticmethod
-    def of(view: View, mesh: TetMesh, order: MemoryOrder) -> HatTables:
-        """Upload the tables of a mesh in an order; built once for a topology."""
-        edges, faces = order.topology.cached("render.hat_tables", lambda: _ranked_tables(mesh.topology, order))
-        return HatTables(view.backend.uints(edges), view.backend.uints(faces))
 
 
 @dataclass
@@ -241,7 +219,7 @@ class _HatKernel:
         samples, transmittance, rest = self._sample(step, ray)
         self._finish_vertices(step, samples)
         vertices = [*_turned(step.exit, [corner.vertex for corner in step.face.corners]), step.apex.vertex]
-        cell = _RankedCell(self.tables, step.cell, _ranks(vertices))
+        cell = RankedCell(self.tables, step.cell, ranks_of(vertices))
         edges, edge_ids = self._finish_edges(step.exit, ray, samples, cell)
         return HatRay(transmittance, rest, edges, edge_ids, self._finish_faces(ray, samples, cell))
 
@@ -298,7 +276,7 @@ class _HatKernel:
             corner.adjoints = response
 
     def _finish_edges(
-        self, exit_: Exit, ray: HatRay, samples: _Samples, cell: _RankedCell
+        self, exit_: Exit, ray: HatRay, samples: _Samples, cell: RankedCell
     ) -> tuple[list[Response], list[Any]]:
         """Scatter the three edges at the dropped corner; returns those of the next face."""
         rows = _turned_rows(exit_, [[known, *edge] for known, edge in zip(ray.edge_ids, ray.edges, strict=True)])
@@ -314,7 +292,7 @@ class _HatKernel:
         kept = _turned_back(exit_, [old[_DROPPED], new[_BEFORE], new[_AFTER]])
         return [row[1:] for row in kept], [row[0] for row in kept]
 
-    def _finish_faces(self, ray: HatRay, samples: _Samples, cell: _RankedCell) -> Response:
+    def _finish_faces(self, ray: HatRay, samples: _Samples, cell: RankedCell) -> Response:
         """Scatter the face entered through and the two passed by; returns the response of the face left through."""
         entered = _plus(ray.face, samples.respond(_DROPPED, _AFTER, _BEFORE))
         self._scatter_face(cell.face(_APEX), entered)
@@ -348,26 +326,6 @@ class _HatKernel:
         return [dr.zeros(self.view.backend.Float, dr.width(self.rays.pixel)) for _ in range(4)]
 
 
-@dataclass
-class _RankedCell:
-    """A cell, and the places of its corners among each other by the indices of their vertices."""
-
-    tables: HatTables
-    cell: Any
-    ranks: list[Any]
-
-    def edge(self, one: int, other: int, active: Any = True) -> Any:
-        """Index of the edge that joins two corners."""
-        first, second = self.ranks[one], self.ranks[other]
-        low, high = dr.select(first < second, first, second), dr.select(first < second, second, first)
-        row = 6 * self.cell + ((low * (7 - low)) >> 1) + (high - low - 1)  # in the order of LOCAL_EDGES
-        return dr.gather(type(self.cell), self.tables.edges, row, active)
-
-    def face(self, opposite: int) -> Any:
-        """Index of the face opposite a corner."""
-        return dr.gather(type(self.cell), self.tables.faces, 4 * self.cell + self.ranks[opposite])
-
-
 def _barycentric(step: Step) -> tuple[list[Any], list[Any]]:
     """Coordinates of the cell's corners where the ray enters and where it leaves."""
     first, last = (_turned(step.exit, face.weights()) for face in (step.face, step.next_face))
@@ -391,30 +349,9 @@ def _turned_back(exit_: Exit, rows: list[list[Any]]) -> list[list[Any]]:
     return [_select(dropped[k], rows[0], _select(dropped[(k + 2) % 3], rows[1], rows[2])) for k in range(3)]
 
 
-def _ranks(vertices: list[Any]) -> list[Any]:
-    """Place of each of a cell's vertices among all four by index."""
-    uint = type(vertices[0])
-    ranks = []
-    for vertex in vertices:
-        rank = uint(0)
-        for other in vertices:
-            rank += dr.select(other < vertex, uint(1), uint(0))
-        ranks.append(rank)
-    return ranks
-
-
 def _plus(one: Response, other: Response) -> Response:
     return [x + y for x, y in zip(one, other, strict=True)]
 
 
 def _select(mask: Any, one: Response, other: Response) -> Response:
     return [dr.select(mask, x, y) for x, y in zip(one, other, strict=True)]
-
-
-def _ranked_tables(topology: Topology, order: MemoryOrder) -> tuple[torch.Tensor, torch.Tensor]:
-    # Vertices of a cell are ranked by their numbers in memory; their places in the cell are the mesh's.
-    ranked = order.topology.tets.argsort(dim=1)
-    edges, faces = (table.index_select(0, order.cells) for table in (cell_edges(topology), cell_faces(topology)))
-    local = torch.tensor(LOCAL_EDGE_OF, device=ranked.device)
-    columns = torch.stack([local[ranked[:, i], ranked[:, j]] for i, j in LOCAL_EDGES], 1)
-    return torch.gather(edges, 1, columns).contiguous(), torch.gather(faces, 1, ranked).contiguous()
