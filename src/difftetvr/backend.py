@@ -126,14 +126,14 @@ class Backend:
         return tensor.view(shape) if shape else tensor
 
     @contextmanager
-    def exclusive(self, in_order: bool = False, most_threads: int = 1) -> Iterator[None]:
+    def exclusive(self, in_order: bool = False, threads_in_order: int = 1) -> Iterator[None]:
         """Run kernels while no other Python thread does.
 
         Dr.Jit's pool of threads is one a process, and kernels use all of it, so renderings take turns.
 
         Args:
             in_order: Whether sums over rays are taken in a fixed order. GPUs cannot: their atomic additions have none.
-            most_threads: CPU threads that they may then run on.
+            threads_in_order: CPU threads that kernels then run on.
 
         Raises:
             BackendError: This process was forked from one that had run kernels.
@@ -151,10 +151,10 @@ class Backend:
             # Values of the forward pass may be asked for by autograd's thread, which Dr.Jit must be told of.
             dr.detail.new_scope(dr.backend_v(self.Float))
             threads = dr.thread_count() if in_order and self.name == "llvm" else 0
-            if threads <= most_threads:
+            if threads == threads_in_order:
                 threads = 0
             if threads:
-                dr.set_thread_count(most_threads)
+                dr.set_thread_count(threads_in_order)
             try:
                 yield
             finally:

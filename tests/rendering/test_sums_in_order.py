@@ -83,17 +83,15 @@ def test_depths() -> None:
 
 
 def assert_in_order(gradients: Callable[[bool], list[torch.Tensor]]) -> None:
-    """Equal to the bit with one number of threads, and to rounding with others and in any order."""
+    """Equal to the bit with any number of threads, and to rounding to sums in any order."""
     first = gradients(True)
     assert all(float(part.norm()) > 0.0 for part in first)
     for _ in range(REPETITIONS):
         assert all(torch.equal(one, other) for one, other in zip(first, gradients(True), strict=True))
     threads = dr.thread_count()
-    others = [gradients(False)]
-    for count in (1, 2 * threads):
+    for count in (1, 2, 3, 4, 7):
         dr.set_thread_count(count)
-        others.append(gradients(True))
+        assert all(torch.equal(one, other) for one, other in zip(first, gradients(True), strict=True))
     dr.set_thread_count(threads)
-    for parts in others:
-        for one, other in zip(first, parts, strict=True):
-            assert float((one - other).norm()) <= 1e-12 * float(one.norm())
+    for one, other in zip(first, gradients(False), strict=True):
+        assert float((one - other).norm()) <= 1e-12 * float(one.norm())

@@ -131,7 +131,7 @@ class FitConfig:
     seed: int = 0
     """Seed of the order of the views, of those that refinements are judged on, and of random backgrounds."""
     deterministic: bool = True
-    """Repeatable to the last bit on one machine, also across --resume; on CPUs at most eight threads then go backward.
+    """Repeatable to the last bit on one machine, also across --resume; on CPUs at most four threads then go backward.
     False is faster on many cores."""
     device: str | None = None
     """Where to run, such as cpu, cuda or mps; default: the best that works."""

@@ -127,7 +127,7 @@ def render(
         transmittance_threshold: Rays stop once their transmittance is at or below this value, in [0, 1), and with them
             what they integrate; 0 stops none.
         deterministic: Whether gradients are the same in every run to the last bit, as images always are. CPU only: the
-            backward pass then runs on at most eight threads, with ``marching``, else on one.
+            backward pass then runs on at most four threads, with ``marching``, else on one.
         clip_plane: (4,) a, b, c, d: only what lies in the half-space a x + b y + c z + d >= 0 of the world is seen.
 
     Returns:

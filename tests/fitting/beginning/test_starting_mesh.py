@@ -216,9 +216,10 @@ def test_refinement_predicts_nothing_where_nothing_would_change(room: dtv.Captur
         trainer.parameters.density.copy_(0.05 * room.density_unit / trainer.parameters.density_unit)
     values = trainer.parameters.values(room.density_unit)
     torch.testing.assert_close(values[:, 3], torch.full_like(values[:, 3], 0.05))
-    model = trainer._model([1, 2])
-    bisections = model.edges.gradient.abs().max()
     mesh = trainer.mesh
+    model = trainer._judgement(2).model(mesh, trainer.parameters.detached_field(), True)
+    model = model.with_density_unit(room.density_unit)
+    bisections = model.edges.gradient.abs().max()
     flips = flip_gains(find_flips(mesh, min_quality=0.0), values, model)
     costs = collapse_costs(mesh, values, model.vertices, removable_vertices(mesh, slide=True), 1.0)
     assert float(bisections) > 1e-5

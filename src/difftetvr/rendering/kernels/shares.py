@@ -1,8 +1,9 @@
 """Sums over rays in a certain order, on several threads (Dr.Jit).
 
-Additions of several threads have no order, and so no certain last bits. For sums that are the same in every run each
-block of lanes that a thread works through, whichever that is, adds to a copy of its own; the copies are added up one
-after the other. Dr.Jit makes two blocks for each thread, as long as these have no more than 16384 lanes.
+Additions of several threads have no order, and so no certain last bits. For sums that are the same in every run lanes
+are dealt out to some copies of what they add to, and the copies are added up one after the other. Dr.Jit gives threads
+blocks of lanes: two blocks for each thread, of equal size, as long as these have no more than 16384 lanes. So with 1, 2
+and 4 threads, up to half of the copies, no two add to the same copy, and all numbers of threads come to the same bits.
 """
 
 from __future__ import annotations
@@ -15,10 +16,10 @@ import drjit as dr
 
 from difftetvr.rendering.traversal.crossing import Tracer
 
-MOST_THREADS = 8
-"""Threads that take part: each means two copies of all that is added to."""
+COPIES = 8
+"""Twice the threads that take part: more copies would let more of them, but take longer to add up."""
 
-_LANES_OF_A_BLOCK = 16384
+_LANES_OF_A_LAUNCH = 2 * 2 * 16384  # so that two threads have no more than Dr.Jit's blocks
 _WIDEST_PACKET = 16
 _MOST_LAUNCHES = 64
 
@@ -48,18 +49,14 @@ class Deal:
 
     @staticmethod
     def of(tracer: Tracer, in_order: bool) -> Deal:
-        """One copy for all lanes, or as many as sums in order need on the threads that there are.
-
-        Those should be as :func:`threads_in_order` says.
-        """
-        backend, lane_count = tracer.view.backend, tracer.view.rays.lane_count
-        if not in_order or backend.name != "llvm" or dr.thread_count() == 1:
+        """One copy for all lanes; several for sums in order, on as many threads as :func:`threads_in_order` says."""
+        lane_count = tracer.view.rays.lane_count
+        if not in_order or not _is_dealt_out(tracer):
             return Deal(Shares(), None, None, [])
-        copies = 2 * dr.thread_count()
-        packets = -(-lane_count // (copies * _WIDEST_PACKET))
-        lanes = min(_LANES_OF_A_BLOCK, packets * _WIDEST_PACKET)
-        starts = [backend.constant(start) for start in range(0, lane_count, copies * lanes)]
-        return Deal(Shares(copies), backend.lanes(copies * lanes), backend.constant(lanes), starts)
+        backend, packets = tracer.view.backend, -(-lane_count // (COPIES * _WIDEST_PACKET))
+        lanes = min(_LANES_OF_A_LAUNCH // COPIES, packets * _WIDEST_PACKET)
+        starts = [backend.constant(start) for start in range(0, lane_count, COPIES * lanes)]
+        return Deal(Shares(COPIES), backend.lanes(COPIES * lanes), backend.constant(lanes), starts)
 
     def trace(self, tracer: Tracer, run: Callable[[Tracer, Any | None], None]) -> None:
         """Run a kernel on all lanes.
@@ -78,8 +75,14 @@ class Deal:
 
 
 def threads_in_order(tracer: Tracer) -> int:
-    """Threads for kernels whose sums shall have an order: one, where lanes cannot be dealt out."""
-    count = tracer.view.rays.lane_count
-    if tracer.on_lanes(tracer.view.lane) is None or count > _MOST_LAUNCHES * _LANES_OF_A_BLOCK:
+    """Threads for kernels whose sums shall have an order: a power of two, and one where lanes cannot be dealt out."""
+    if not _is_dealt_out(tracer):
         return 1
-    return MOST_THREADS
+    return 1 << (min(dr.thread_count(), COPIES // 2).bit_length() - 1)
+
+
+def _is_dealt_out(tracer: Tracer) -> bool:
+    view = tracer.view
+    if view.backend.name != "llvm" or tracer.on_lanes(view.lane) is None:
+        return False
+    return view.rays.lane_count <= _MOST_LAUNCHES * _LANES_OF_A_LAUNCH
