@@ -6,6 +6,7 @@ from . import files as files
 from . import fitting as fitting
 from . import mesh as mesh
 from . import optics as optics
+from . import recording as recording
 from . import rendering as rendering
 from . import sampling as sampling
 from . import trust as trust
