@@ -150,15 +150,14 @@ class Backend:
         with _TURN:
             # Values of the forward pass may be asked for by autograd's thread, which Dr.Jit must be told of.
             dr.detail.new_scope(dr.backend_v(self.Float))
-            threads = dr.thread_count() if in_order and self.name == "llvm" else 0
-            if threads == threads_in_order:
-                threads = 0
-            if threads:
+            threads = dr.thread_count()
+            changes_threads = in_order and self.name == "llvm" and threads != threads_in_order
+            if changes_threads:
                 dr.set_thread_count(threads_in_order)
             try:
                 yield
             finally:
-                if threads:
+                if changes_threads:
                     dr.sync_thread()
                     dr.set_thread_count(threads)
 

@@ -10,6 +10,7 @@ from difftetvr.backend import dr
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.optics import TransferFunction
 from difftetvr.rendering import Camera, Rays, ScalarField, depth_at, render
+from difftetvr.rendering.kernels import shares
 
 pytestmark = pytest.mark.usefixtures("kernel_threads")
 
@@ -51,31 +52,45 @@ def ragged_rays() -> Rays:
     return Rays(3.0 * (uniform(1003, 3, seed=4) - 0.5), uniform(1003, 3, seed=5) - 0.5, near=-1.0, far=2.0)
 
 
+def scene(
+    make_field: Callable[[TetMesh], tuple[Any, list[torch.Tensor]]],
+) -> tuple[TetMesh, Any, list[torch.Tensor]]:
+    """A mesh whose vertices require a gradient, a field on it, and the leaves that it is made of."""
+    still = mesh()
+    field, leaves = make_field(still)
+    return still.with_vertices(still.vertices.clone().requires_grad_()), field, leaves
+
+
 def image_gradients(
     make_field: Callable[[TetMesh], tuple[Any, list[torch.Tensor]]], view: Any, in_order: bool
 ) -> list[torch.Tensor]:
-    scene = mesh()
-    vertices = scene.vertices.clone().requires_grad_()
-    field, leaves = make_field(scene)
-    image = render(scene.with_vertices(vertices), field, view, deterministic=in_order)
+    moved, field, leaves = scene(make_field)
+    image = render(moved, field, view, deterministic=in_order)
     loss = (image.color.square().sum() + image.optical_depth.sum()) / image.alpha.numel()
-    return list(torch.autograd.grad(loss, [vertices, *leaves]))
+    return list(torch.autograd.grad(loss, [moved.vertices, *leaves]))
 
 
 def depth_gradients(
     make_field: Callable[[TetMesh], tuple[Any, list[torch.Tensor]]], view: Any, in_order: bool
 ) -> list[torch.Tensor]:
-    scene = mesh()
-    vertices = scene.vertices.clone().requires_grad_()
-    field, leaves = make_field(scene)
-    depths = depth_at(scene.with_vertices(vertices), field, view, 0.7, deterministic=in_order)
-    return list(torch.autograd.grad(depths[depths.isfinite()].sum(), [vertices, leaves[1]]))
+    moved, field, leaves = scene(make_field)
+    depths = depth_at(moved, field, view, 0.7, deterministic=in_order)
+    return list(torch.autograd.grad(depths[depths.isfinite()].sum(), [moved.vertices, leaves[1]]))
 
 
 @pytest.mark.parametrize("make_field", [vertex_field, cell_field, scalar_field])
 @pytest.mark.parametrize("view", [CAMERA, LARGE, ragged_rays()], ids=["camera", "large", "rays"])
 def test_images(make_field: Callable[[TetMesh], tuple[Any, list[torch.Tensor]]], view: Any) -> None:
     assert_in_order(lambda in_order: image_gradients(make_field, view, in_order))
+
+
+def test_meshes_too_large_for_copies(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert_in_order(lambda in_order: image_gradients(vertex_field, CAMERA, in_order))
+    in_copies = image_gradients(vertex_field, CAMERA, True)
+    monkeypatch.setattr(shares, "_MOST_FLOATS", 1)
+    assert_in_order(lambda in_order: image_gradients(vertex_field, CAMERA, in_order))
+    for one, other in zip(in_copies, image_gradients(vertex_field, CAMERA, True), strict=True):
+        assert float((one - other).norm()) <= 1e-12 * float(one.norm())
 
 
 def test_depths() -> None:

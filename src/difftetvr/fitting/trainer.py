@@ -18,7 +18,7 @@ from difftetvr.fitting.metrics import psnr_of_mse
 from difftetvr.fitting.parameters import FieldParameters
 from difftetvr.fitting.positions import StepReport, VertexOptimizer
 from difftetvr.fitting.records.checkpoint import Checkpoint, describe_capture, require_same_capture
-from difftetvr.fitting.records.evaluation import evaluate, true_image, valid_share, where_valid
+from difftetvr.fitting.records.evaluation import counted_share, evaluate, true_image, where_valid
 from difftetvr.fitting.records.history import History, MoveTotals, RefinementRecord
 from difftetvr.fitting.records.result import Progress
 from difftetvr.fitting.refinement import Moment, Refinement, Situation, Strategy
@@ -28,7 +28,6 @@ from difftetvr.rendering import render
 from difftetvr.rendering.gauss_newton import ImageModel
 
 _GLANCE_VIEWS = 4
-_LEAST_SHARE = 1e-6  # of the pixels: a view that is masked altogether has no error
 _POSITIONS = "positions."  # prefix of the positions' state in a checkpoint
 
 
@@ -225,7 +224,6 @@ class Trainer:
         if self.strategy is None or not self.strategy.is_due(self._moment()):
             return
         judgement, mesh = self._judgement(self.strategy.views), self.mesh
-
         unit = self.capture.density_unit
 
         def model(face_steps: torch.Tensor | None) -> ImageModel:
@@ -281,10 +279,6 @@ class Trainer:
         if refinement.surplus is not None:
             self.parameters.add(refinement.surplus, self.capture.density_unit)
 
-    def _share(self, view: int) -> float:
-        """Share of a view's pixels that count, by which means over all pixels are divided; never 0."""
-        return max(valid_share(self.capture, view), _LEAST_SHARE)
-
     def _color_gradients(self) -> torch.Tensor:
         """(V,) sums over all training views of the absolute derivatives of the loss by the vertices' colours."""
         background = self.config.background_at(self.iteration)
@@ -311,7 +305,7 @@ class Trainer:
             deterministic=self.config.deterministic,
         ).color
         image = where_valid(self.capture, view, image, truth)
-        share = self._share(view)
+        share = counted_share(None if self.capture.valid is None else self.capture.valid[view])
         loss = LOSSES[self.config.loss](image, truth) / share
         if self.config.sparsity:
             loss = loss + self.config.sparsity * sparsity(self.parameters.density)

@@ -207,7 +207,7 @@ def _measures(source: _CellSource) -> tuple[Any, Any]:
 
 def measured(a: Vector, b: Vector, c: Vector) -> tuple[Any, Any]:
     """Determinant and quality of a cell with edges from its first corner, for kernels of others, too."""
-    determinant = _dot(a, _cross(b, c))
+    determinant = dot(a, cross(b, c))
     return determinant, _quality(determinant, _squared_edges(a, b, c, _sum(a, b, c)))
 
 
@@ -224,13 +224,13 @@ def _shapes(source: _CellSource, weigh: Callable[[Any], Any] | None, length: int
     """
     a, b, c = source.edges()
     # Twice the area vectors of the faces opposite corners 1, 2 and 3, pointing inwards; all four add up to zero.
-    normals = (_cross(b, c), _cross(c, a), _cross(a, b))
+    normals = (cross(b, c), cross(c, a), cross(a, b))
     total_normal, total = _sum(*normals), _sum(a, b, c)
-    determinant, squares = _dot(a, normals[0]), _squared_edges(a, b, c, total)
+    determinant, squares = dot(a, normals[0]), _squared_edges(a, b, c, total)
     quality = _quality(determinant, squares)
-    largest = _dot(total_normal, total_normal)
+    largest = dot(total_normal, total_normal)
     for normal in normals:
-        largest = dr.fmax(largest, _dot(normal, normal))
+        largest = dr.fmax(largest, dot(normal, normal))
     altitude = determinant / dr.sqrt(largest)
 
     # -log Q = -log det + 3/2 log S; the gradient of det at corner k is its normal, that of S is 2 (4 x_k - sum of x).
@@ -281,11 +281,13 @@ def _sums_of_stars(source: _StarSource, length: int) -> Any:
     return result
 
 
-def _cross(p: Vector, q: Vector) -> Vector:
+def cross(p: Vector, q: Vector) -> Vector:
+    """Cross product, in kernels."""
     return [dr.fma(p[i], q[j], -(p[j] * q[i])) for i, j in ((1, 2), (2, 0), (0, 1))]
 
 
-def _dot(p: Vector, q: Vector) -> Any:
+def dot(p: Vector, q: Vector) -> Any:
+    """Dot product, in kernels."""
     return dr.fma(p[0], q[0], dr.fma(p[1], q[1], p[2] * q[2]))
 
 
@@ -295,7 +297,7 @@ def _sum(p: Vector, q: Vector, r: Vector) -> Vector:
 
 def _squared_edges(a: Vector, b: Vector, c: Vector, total: Vector) -> Any:
     """Sum of the six squared edge lengths; the subtraction cancels at most three quarters."""
-    return dr.fma(4.0, _dot(a, a) + _dot(b, b) + _dot(c, c), -_dot(total, total))
+    return dr.fma(4.0, dot(a, a) + dot(b, b) + dot(c, c), -dot(total, total))
 
 
 def _quality(determinant: Any, squares: Any) -> Any:

@@ -18,6 +18,7 @@ from difftetvr.rendering import render
 Color = tuple[float, float, float]
 BLACK: Color = (0.0, 0.0, 0.0)
 WHITE: Color = (1.0, 1.0, 1.0)
+_LEAST_SHARE = 1e-6  # of the pixels
 
 
 @dataclass(frozen=True)
@@ -88,6 +89,11 @@ def where_valid(capture: Capture, view: int, image: torch.Tensor, truth: torch.T
 def valid_share(capture: Capture, view: int) -> float:
     """Share of a view's pixels that the capture's mask does not leave out."""
     return 1.0 if capture.valid is None else float(capture.valid[view].float().mean())
+
+
+def counted_share(valid: torch.Tensor | None) -> float:
+    """Share of pixels that count, by which means over all of them are divided; never 0, for then there is no error."""
+    return 1.0 if valid is None else max(float(valid.float().mean()), _LEAST_SHARE)
 
 
 @torch.no_grad()

@@ -8,8 +8,10 @@ from typing import Any
 import drjit as dr
 import torch
 
-from difftetvr.backend import Backend, get_backend
+from difftetvr.backend import get_backend
 from difftetvr.mesh import TetMesh
+from difftetvr.mesh.changes.collapse_shapes import Collapses
+from difftetvr.mesh.shapes import cross, dot
 from difftetvr.recording import replayed
 from difftetvr.rendering.gauss_newton import HatDerivatives
 
@@ -17,27 +19,15 @@ _ON_A_FACE = 1e-6  # so far outside of a cell, in barycentric coordinates, a poi
 
 
 @dataclass
-class _Collapses:
-    """What the kernel reads, flat.
+class _Prices:
+    """What the kernel reads beside the collapses, flat.
 
     Attributes:
-        backend: Array types, float64.
-        removed, kept: (N,) vertices.
-        tets: (T, 4) vertices of cells.
-        offsets, cells: Cells around vertices, see :attr:`difftetvr.mesh.Topology.vertex_cells`.
-        vertices: (V, 4) positions, and padding.
         values: (V, 4) parameters.
         colors: (V, 4) second derivatives by each colour, and mixed ones by colours and density.
         absorption: (V,) second derivatives by density.
     """
 
-    backend: Backend
-    removed: Any
-    kept: Any
-    tets: Any
-    offsets: Any
-    cells: Any
-    vertices: Any
     values: Any
     colors: Any
     absorption: Any
@@ -60,23 +50,16 @@ def costs_of_collapses(
     """
     if not len(removed):
         return values.new_zeros(0, dtype=torch.float64)
-    topology = mesh.topology
     backend = get_backend(str(mesh.vertices.device), torch.float64)
-    offsets, cells = topology.vertex_cells
-    positions = torch.nn.functional.pad(mesh.vertices.detach().double(), (0, 1))
     colors = torch.cat((hats.emission[:, None], hats.coupling), 1)
     with backend.exclusive():
-        floats, uints = backend.floats, backend.uints
-        collapses = _Collapses(
-            backend,
-            *(uints(table) for table in (removed, kept, topology.tets, offsets, cells)),
-            *(floats(table) for table in (positions, values, colors, hats.absorption)),
-        )
-        return backend.tensor(replayed(_costs, collapses))
+        collapses = Collapses.of(backend, mesh, removed, kept)
+        prices = _Prices(*(backend.floats(table) for table in (values, colors, hats.absorption)))
+        return backend.tensor(replayed(_costs, collapses, prices))
 
 
-def _costs(collapses: _Collapses) -> Any:
-    cost = _Star(collapses).cost()
+def _costs(collapses: Collapses, prices: _Prices) -> Any:
+    cost = _Star(collapses, prices).cost()
     dr.eval(cost)
     return cost
 
@@ -84,31 +67,29 @@ def _costs(collapses: _Collapses) -> Any:
 class _Star:
     """The cells around a vertex that is merged into another, as they would be."""
 
-    def __init__(self, collapses: _Collapses) -> None:
-        self.read, backend = collapses, collapses.backend
-        self.removed, self.kept = backend.UInt(collapses.removed), backend.UInt(collapses.kept)
-        self.first, self.end = (dr.gather(backend.UInt, collapses.offsets, self.removed + k) for k in range(2))
-        self.place, self.apex = self._position(self.removed), self._position(self.kept)
-        self.old, self.apex_values = (self._values(vertex) for vertex in (self.removed, self.kept))
+    def __init__(self, collapses: Collapses, prices: _Prices) -> None:
+        self.collapses, self.prices, self.real = collapses, prices, collapses.backend.Float
+        self.first, self.end = collapses.star()
+        self.place, self.apex = (collapses.position(vertex) for vertex in (collapses.removed, collapses.kept))
+        self.old, self.apex_values = (self._values(vertex) for vertex in (collapses.removed, collapses.kept))
 
     def cost(self) -> Any:
         """Cost of giving the vertex the value that is interpolated there afterwards, and of the bends."""
-        real = self.read.backend.Float
-        nowhere = dr.full(real, -dr.inf, dr.width(self.removed))
+        nowhere = dr.full(self.real, -dr.inf, dr.width(self.collapses.removed))
 
-        def find_holder(cell: Any, least: Any, after: list[Any]) -> Any:
-            corners, is_left = self._corners(cell)
+        def find_holder(place: Any, least: Any, after: list[Any]) -> Any:
+            corners, is_left = self._corners(place)
             weights, _ = self._weights(corners)
             smallest = dr.fmin(dr.fmin(weights[0], weights[1]), dr.fmin(weights[2], weights[3]))
             is_better = is_left & dr.isfinite(smallest) & (smallest > least)
             here = self._extrapolated(corners, weights)
-            return cell + 1, dr.select(is_better, smallest, least), _select(is_better, here, after)
+            return place + 1, dr.select(is_better, smallest, least), _select(is_better, here, after)
 
         state = (self.first, nowhere, [dr.zeros_like(nowhere) for _ in range(4)])
-        _, least, after = dr.while_loop(state, lambda cell, *_: cell < self.end, find_holder)
+        _, least, after = dr.while_loop(state, lambda place, *_: place < self.end, find_holder)
 
-        def add_bend(cell: Any, bends: Any, volumes: Any) -> Any:
-            corners, is_left = self._corners(cell)
+        def add_bend(place: Any, bends: Any, volumes: Any) -> Any:
+            corners, is_left = self._corners(place)
             weights, volume = self._weights(corners)
             # The old and the new cell at a face overlap down to this share of the way to the apex. There, the other
             # new cells differ from what the hat explains by how much their functions differ, seen from the place.
@@ -116,36 +97,29 @@ class _Star:
             reach = 1.0 / dr.fmax(weights[3] + 3.0 * side, _ON_A_FACE)
             deviation = [reach * (x - y) for x, y in zip(self._extrapolated(corners, weights), after, strict=True)]
             bend = self._curvature(deviation) * volume
-            return cell + 1, bends + dr.select(is_left, bend, 0.0), volumes + dr.select(is_left, volume, 0.0)
+            return place + 1, bends + dr.select(is_left, bend, 0.0), volumes + dr.select(is_left, volume, 0.0)
 
         begin = (self.first, dr.zeros_like(nowhere), dr.zeros_like(nowhere))
-        _, bends, volumes = dr.while_loop(begin, lambda cell, *_: cell < self.end, add_bend)
+        _, bends, volumes = dr.while_loop(begin, lambda place, *_: place < self.end, add_bend)
         own = self._curvature([x - y for x, y in zip(after, self.old, strict=True)])
         return dr.select(least > -_ON_A_FACE, 0.5 * (bends / volumes + own), dr.nan)
 
-    def _position(self, vertex: Any, active: Any = True) -> list[Any]:
-        packet = dr.gather(self.read.backend.Float4, self.read.vertices, vertex, active)
-        return [packet[k] for k in range(3)]
+    def _values(self, vertex: Any) -> list[Any]:
+        return list(dr.gather(self.collapses.backend.Float4, self.prices.values, vertex))
 
-    def _values(self, vertex: Any, active: Any = True) -> list[Any]:
-        return list(dr.gather(self.read.backend.Float4, self.read.values, vertex, active))
-
-    def _corners(self, cell: Any) -> tuple[list[Any], Any]:
+    def _corners(self, place: Any) -> tuple[list[Any], Any]:
         """Vertices of the face opposite the removed vertex, and whether the cell is still there afterwards."""
-        backend = self.read.backend
-        number = dr.gather(backend.UInt, self.read.cells, cell)
-        tet = dr.gather(backend.UInt4, self.read.tets, number)
-        is_left = ~((tet[0] == self.kept) | (tet[1] == self.kept) | (tet[2] == self.kept) | (tet[3] == self.kept))
+        tet, vanishes = self.collapses.tet(place)
         # The last corner stands in for the removed one, except where that is the last.
-        return [dr.select(tet[k] == self.removed, tet[3], tet[k]) for k in range(3)], is_left
+        return [dr.select(tet[k] == self.collapses.removed, tet[3], tet[k]) for k in range(3)], ~vanishes
 
     def _weights(self, corners: list[Any]) -> tuple[list[Any], Any]:
         """Barycentric coordinates of the place in a new cell, the apex last, and six times the cell's volume."""
-        a, b, c = ([x - y for x, y in zip(self._position(k), self.apex, strict=True)] for k in corners)
-        normals = (_cross(b, c), _cross(c, a), _cross(a, b))
-        volume = _dot(a, normals[0])
+        a, b, c = ([x - y for x, y in zip(self.collapses.position(k), self.apex, strict=True)] for k in corners)
+        normals = (cross(b, c), cross(c, a), cross(a, b))
+        volume = dot(a, normals[0])
         place = [x - y for x, y in zip(self.place, self.apex, strict=True)]
-        sides = [_dot(place, normal) / volume for normal in normals]
+        sides = [dot(place, normal) / volume for normal in normals]
         return [*sides, 1.0 - (sides[0] + sides[1] + sides[2])], dr.abs(volume)
 
     def _extrapolated(self, corners: list[Any], weights: list[Any]) -> list[Any]:
@@ -157,19 +131,11 @@ class _Star:
 
     def _curvature(self, step: list[Any]) -> Any:
         """See :meth:`difftetvr.rendering.gauss_newton.HatDerivatives.curvature`."""
-        emission, *coupling = dr.gather(self.read.backend.Float4, self.read.colors, self.removed)
-        absorption = dr.gather(self.read.backend.Float, self.read.absorption, self.removed)
+        emission, *coupling = dr.gather(self.collapses.backend.Float4, self.prices.colors, self.collapses.removed)
+        absorption = dr.gather(self.real, self.prices.absorption, self.collapses.removed)
         color, density = step[:3], step[3]
-        return emission * _dot(color, color) + density * (absorption * density + 2.0 * _dot(coupling, color))
+        return emission * dot(color, color) + density * (absorption * density + 2.0 * dot(coupling, color))
 
 
 def _select(mask: Any, one: list[Any], other: list[Any]) -> list[Any]:
     return [dr.select(mask, x, y) for x, y in zip(one, other, strict=True)]
-
-
-def _cross(a: list[Any], b: list[Any]) -> list[Any]:
-    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-
-
-def _dot(a: list[Any], b: list[Any]) -> Any:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

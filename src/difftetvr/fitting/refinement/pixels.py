@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from difftetvr.capture.capture import Capture
-from difftetvr.fitting.records.evaluation import Color, true_image
+from difftetvr.fitting.records.evaluation import Color, counted_share, true_image
 from difftetvr.mesh.field import Field
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.rendering import Rays, render
@@ -21,7 +21,6 @@ from difftetvr.rendering.rays import image_order
 _CROSSINGS = 400.0
 """How often a cell is crossed, on average, by the rays of all pixels; a ray crosses about as many cells as the mesh has
 along one of its sides. On the Tooth at 20 k cells 40 cost 2 dB, 160 cost 0.3 dB of what 270 give: all pixels there."""
-_LEAST_SHARE = 1e-6  # of the pixels: where all are masked there is no error
 
 
 @dataclass(frozen=True)
@@ -57,18 +56,14 @@ class JudgedPixels:
 
     def spread(self, count: int, begin: float) -> JudgedPixels:
         """About as many as are asked for, in equal steps along their order; ``begin`` is in parts of a step."""
-        count = min(count, self.count)
+        if count >= self.count:
+            return self
         return self._at(((torch.arange(count, dtype=torch.float64) + begin) * (self.count / count)).long())
 
     def _at(self, places: torch.Tensor) -> JudgedPixels:
         rays = Rays(self.rays.origins[:, places], self.rays.directions[:, places])
         valid = None if self.valid is None else self.valid[:, places]
         return JudgedPixels(rays, self.truth[:, places], valid, self.background)
-
-    @property
-    def _share(self) -> float:
-        """Share of the pixels that count, by which means over all pixels are divided; never 0."""
-        return 1.0 if self.valid is None else max(float(self.valid.float().mean()), _LEAST_SHARE)
 
     def model(
         self, mesh: TetMesh, field: Field, deterministic: bool, face_steps: torch.Tensor | None = None
@@ -84,7 +79,7 @@ class JudgedPixels:
             valid=self.valid,
             face_steps=face_steps,
         )
-        return replace(model, error=model.error / self._share)
+        return replace(model, error=model.error / counted_share(self.valid))
 
     @torch.no_grad()
     def error(self, mesh: TetMesh, field: Field) -> float:
@@ -93,7 +88,7 @@ class JudgedPixels:
         squares = (image.color - self.truth.to(image.color)).square()
         if self.valid is not None:
             squares = squares * self.valid.to(squares.device)[..., None]
-        return float(squares.mean()) / self._share
+        return float(squares.mean()) / counted_share(self.valid)
 
 
 @dataclass(frozen=True)

@@ -16,16 +16,15 @@ from difftetvr.recording import replayed
 
 
 @dataclass
-class _Collapses:
-    """What the kernel reads, flat.
+class Collapses:
+    """Half-edge collapses as kernels read them, a candidate a lane, flat.
 
     Attributes:
         backend: Array types, float64.
         removed, kept: (N,) vertices.
         tets: (T, 4) vertices of cells.
-        offsets, cells: Cells around vertices.
-        points: (V, 4) positions, and padding.
-        floor: Least quality that cells may get, unless they had less.
+        offsets, cells: Cells around vertices, see :attr:`difftetvr.mesh.Topology.vertex_cells`.
+        points: (V, 4) positions in a unit in which no product overflows, and padding.
     """
 
     backend: Backend
@@ -35,7 +34,29 @@ class _Collapses:
     offsets: Any
     cells: Any
     points: Any
-    floor: Any
+
+    @staticmethod
+    def of(backend: Backend, mesh: TetMesh, removed: torch.Tensor, kept: torch.Tensor) -> Collapses:
+        """Upload collapses of (N,) vertices into (N,) others."""
+        offsets, cells = mesh.topology.vertex_cells
+        points = backend.floats(scaled_points(mesh.vertices, length_scale(mesh.vertices)))
+        tables = [backend.uints(table) for table in (removed, kept, mesh.tets, offsets, cells)]
+        return Collapses(backend, tables[0], tables[1], tables[2], tables[3], tables[4], points)
+
+    def star(self) -> tuple[Any, Any]:
+        """First of the places that stand for the cells around the removed vertex, and the one behind the last."""
+        first, end = (dr.gather(self.backend.UInt, self.offsets, self.removed + k) for k in range(2))
+        return first, end
+
+    def tet(self, place: Any) -> tuple[Any, Any]:
+        """Vertices of the cell at a place, and whether it vanishes."""
+        tet = dr.gather(self.backend.UInt4, self.tets, dr.gather(self.backend.UInt, self.cells, place))
+        return tet, (tet[0] == self.kept) | (tet[1] == self.kept) | (tet[2] == self.kept) | (tet[3] == self.kept)
+
+    def position(self, vertex: Any) -> list[Any]:
+        """Position of a vertex."""
+        packet = dr.gather(self.backend.Float4, self.points, vertex)
+        return [packet[k] for k in range(3)]
 
 
 def keeps_shapes(mesh: TetMesh, half_edges: torch.Tensor, min_quality: float) -> tuple[torch.Tensor, torch.Tensor]:
@@ -51,35 +72,29 @@ def keeps_shapes(mesh: TetMesh, half_edges: torch.Tensor, min_quality: float) ->
     """
     if not half_edges.shape[0]:
         return torch.zeros_like(half_edges[:, 0], dtype=torch.bool), half_edges[:, 0].long()
-    backend = get_backend(str(mesh.vertices.device), torch.float64)
-    points = scaled_points(mesh.vertices, length_scale(mesh.vertices))
     removed, kept = half_edges.t().contiguous()
+    backend = get_backend(str(mesh.vertices.device), torch.float64)
     with backend.exclusive():
-        tables = [backend.uints(table) for table in (removed, kept, mesh.tets, *mesh.topology.vertex_cells)]
-        removed_, kept_, tets, offsets, cells = tables
-        floor = backend.opaque(max(min_quality, quality.FLAT))
-        source = _Collapses(backend, removed_, kept_, tets, offsets, cells, backend.floats(points), floor)
-        keeps, vanishing = replayed(_keeps_shapes, source)
+        collapses = Collapses.of(backend, mesh, removed, kept)
+        keeps, vanishing = replayed(_keeps_shapes, collapses, backend.opaque(max(min_quality, quality.FLAT)))
         return backend.tensor(keeps) > 0, backend.tensor(vanishing).long()
 
 
-def _keeps_shapes(source: _Collapses) -> tuple[Any, Any]:
+def _keeps_shapes(collapses: Collapses, floor: Any) -> tuple[Any, Any]:
     """Whether cells stay good, 1 or 0, and how many vanish."""
-    backend, removed, kept = source.backend, source.removed, source.kept
-    begin, end = (dr.gather(backend.UInt, source.offsets, removed + k) for k in range(2))
-    there = _position(source, kept)
+    backend, lanes = collapses.backend, dr.width(collapses.removed)
+    begin, end = collapses.star()
+    there = collapses.position(collapses.kept)
 
     def look(place: Any, worst: Any, worst_before: Any, vanishing: Any) -> tuple[Any, Any, Any, Any]:
-        tet = dr.gather(backend.UInt4, source.tets, dr.gather(backend.UInt, source.cells, place))
-        before = [_position(source, tet[k]) for k in range(4)]
+        tet, vanishes = collapses.tet(place)
+        before = [collapses.position(tet[k]) for k in range(4)]
         after = [
-            [dr.select(tet[k] == removed, new, old) for new, old in zip(there, before[k], strict=True)]
+            [dr.select(tet[k] == collapses.removed, new, old) for new, old in zip(there, before[k], strict=True)]
             for k in range(4)
         ]
-        vanishes = (tet[0] == kept) | (tet[1] == kept) | (tet[2] == kept) | (tet[3] == kept)
-        now, old = _quality(after), _quality(before)
         # What cannot be computed is as bad as can be.
-        now, old = (dr.select(dr.isfinite(value), value, -dr.inf) for value in (now, old))
+        now, old = (dr.select(dr.isfinite(q), q, -dr.inf) for q in (_quality(after), _quality(before)))
         return (
             place + 1,
             dr.select(~vanishes & (now < worst), now, worst),
@@ -87,19 +102,13 @@ def _keeps_shapes(source: _Collapses) -> tuple[Any, Any]:
             vanishing + dr.select(vanishes, backend.Int(1), backend.Int(0)),
         )
 
-    lanes = dr.width(removed)
     most = [dr.full(backend.Float, dr.inf, lanes) for _ in range(2)]
     state = (begin, *most, dr.zeros(backend.Int, lanes))
     _, worst, worst_before, vanishing = dr.while_loop(state, lambda place, *_: place < end, look)
-    keeps = (worst >= source.floor) | ((worst > quality.FLAT) & (worst >= worst_before))
+    keeps = (worst >= floor) | ((worst > quality.FLAT) & (worst >= worst_before))
     result = dr.select(keeps, backend.Int(1), backend.Int(0))
     dr.eval(result, vanishing)
     return result, vanishing
-
-
-def _position(source: _Collapses, vertex: Any) -> list[Any]:
-    packet = dr.gather(source.backend.Float4, source.points, vertex)
-    return [packet[k] for k in range(3)]
 
 
 def _quality(corners: list[list[Any]]) -> Any:

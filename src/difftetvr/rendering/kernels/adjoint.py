@@ -65,8 +65,8 @@ def render_adjoint(
         in_order: Whether sums over rays have a certain order, see :mod:`difftetvr.rendering.kernels.shares`.
     """
     deal = Deal.of(tracer, in_order)
-    sizes = BufferSizes.of(tracer.view, vertex_count, wanted, deal.shares)
-    gradients: Gradients = replayed(_adjoint, tracer, image, deal, sizes, sizes.copies(tracer.view.backend))
+    sizes = BufferSizes.of(tracer.view, vertex_count, wanted, deal.copies)
+    gradients: Gradients = replayed(_adjoint, tracer, image, deal, sizes, sizes.places(tracer.view.backend))
     return gradients
 
 

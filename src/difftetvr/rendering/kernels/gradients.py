@@ -10,7 +10,6 @@ import drjit as dr
 
 from difftetvr.backend import Backend
 from difftetvr.recording import few_lengths
-from difftetvr.rendering.kernels.shares import Shares
 from difftetvr.rendering.traversal.crossing import View
 from difftetvr.rendering.traversal.sums import Copies, Sums
 from difftetvr.rendering.traversal.transfer import TransferGradients
@@ -70,11 +69,10 @@ class GradientSums:
         Args:
             backend: Array types.
             sizes: The sizes.
-            copies: What :meth:`BufferSizes.copies` says about them.
+            copies: What :meth:`BufferSizes.places` says about them.
         """
-        number = sizes.shares.copies
         field, cells, vertices, knots, values = (
-            None if size is None else Sums.zeros(backend, size, places, number, sizes.mode)
+            None if size is None else Sums.zeros(backend, size, places, sizes.mode)
             for size, places in zip(sizes.summed, copies, strict=True)
         )
         return GradientSums(
@@ -110,7 +108,7 @@ class BufferSizes:
 
     Attributes:
         width: Floats in a record of ``field`` and ``cells``.
-        shares: Copies of the buffers.
+        copies: Number of copies of the buffers.
         mode: How additions of several rays to one record are reduced.
     """
 
@@ -122,11 +120,11 @@ class BufferSizes:
     limits: int | None
     lines: int | None
     width: int
-    shares: Shares
+    copies: int
     mode: dr.ReduceMode
 
     @staticmethod
-    def of(view: View, vertex_count: int, wanted: Wanted, shares: Shares) -> BufferSizes:
+    def of(view: View, vertex_count: int, wanted: Wanted, copies: int) -> BufferSizes:
         """Sizes for a view of V vertices; few different ones, for kernels are compiled for them."""
         transfer = view.transfer
         width = view.records.width if view.has_vertex_channels or view.cells is not None else 1
@@ -144,8 +142,8 @@ class BufferSizes:
             limits=2 * view.rays.count if wanted.limits else None,
             lines=6 * view.rays.count if wanted.lines else None,
             width=width,
-            shares=shares,
-            mode=reduce_mode(view, sum(size or 0 for size in (field, cells, vertices)), shares),
+            copies=copies,
+            mode=reduce_mode(view, sum(size or 0 for size in (field, cells, vertices)), copies),
         )
 
     @property
@@ -153,18 +151,15 @@ class BufferSizes:
         """Sizes of the buffers that many rays add to."""
         return self.field, self.cells, self.vertices, self.knots, self.values
 
-    def copies(self, backend: Backend) -> list[Copies | None]:
+    def places(self, backend: Backend) -> list[Copies | None]:
         """Where the copies of these are; None where there is but one."""
-        if self.shares.copies == 1:
-            return [None for _ in self.summed]
-        widths = (self.width, self.width, _POSITION, 1, 1)
-        pairs = zip(self.summed, widths, strict=True)
-        return [None if size is None else Copies.of(backend, size, width) for size, width in pairs]
+        pairs = zip(self.summed, (self.width, self.width, _POSITION, 1, 1), strict=True)
+        return [None if size is None else Copies.of(backend, self.copies, size, width) for size, width in pairs]
 
 
-def reduce_mode(view: View, floats: int, shares: Shares) -> dr.ReduceMode:
+def reduce_mode(view: View, floats: int, copies: int) -> dr.ReduceMode:
     """On CPUs one gradient copy a thread beats atomics, as long as the copies fit a budget."""
-    if shares.copies > 1:
+    if copies > 1:
         return dr.ReduceMode.NoConflicts
     if view.backend.name != "llvm":
         return dr.ReduceMode.Auto

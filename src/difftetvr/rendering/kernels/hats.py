@@ -153,11 +153,9 @@ def hat_records(
     counts = [few_lengths(n) for n in (mesh.num_vertices, topology.edges.shape[0], topology.faces.shape[0])]
     widths = [RECORD, RECORD, RECORD if image.face_steps is None else STEP_RECORD]
     sizes = [count * width for count, width in zip(counts, widths, strict=True)]
-    mode = reduce_mode(view, sum(sizes), deal.shares)
-    copies = [
-        None if deal.lane is None else Copies.of(view.backend, size, width)
-        for size, width in zip(sizes, widths, strict=True)
-    ]
+    mode = reduce_mode(view, sum(sizes), deal.copies)
+    pairs = zip(sizes, widths, strict=True)
+    copies = [Copies.of(view.backend, deal.copies, size, width) for size, width in pairs]
     records: HatRecords = replayed(
         _records, tracer, HatTables.of(view, mesh, order), image, deal, _Buffers(sizes, mode, copies)
     )
@@ -174,9 +172,8 @@ class _Buffers:
 
 
 def _records(tracer: Tracer, tables: HatTables, image: HatImage, deal: Deal, buffers: _Buffers) -> HatRecords:
-    backend, number = tracer.view.backend, deal.shares.copies
-    pairs = zip(buffers.sizes, buffers.copies, strict=True)
-    parts = [Sums.zeros(backend, size, copies, number, buffers.mode) for size, copies in pairs]
+    backend, pairs = tracer.view.backend, zip(buffers.sizes, buffers.copies, strict=True)
+    parts = [Sums.zeros(backend, size, copies, buffers.mode) for size, copies in pairs]
     sums = _HatSums(*parts)
 
     def run(part: Tracer, copy: Any | None) -> None:

@@ -22,27 +22,21 @@ COPIES = 8
 _LANES_OF_A_LAUNCH = 2 * 2 * 16384  # so that two threads have no more than Dr.Jit's blocks
 _WIDEST_PACKET = 16
 _MOST_LAUNCHES = 64
-
-
-@dataclass(frozen=True)
-class Shares:
-    """To how many copies of what they add to the lanes of a kernel are dealt out."""
-
-    copies: int = 1
+_MOST_FLOATS = 1 << 22  # of vertex records: the copies of what refinements are predicted from then take some 2 GB
 
 
 @dataclass
 class Deal:
-    """The same with arrays for kernels.
+    """How the lanes of a kernel are dealt out to copies of what it adds to.
 
     Attributes:
-        shares: How lanes are dealt out.
+        copies: Number of copies.
         lane: Numbers of the lanes of one launch; None where all lanes add to one copy.
         lanes_of_a_copy: How many of them add to each copy.
         starts: The first lane of each launch.
     """
 
-    shares: Shares
+    copies: int
     lane: Any | None
     lanes_of_a_copy: Any | None
     starts: list[Any]
@@ -52,11 +46,11 @@ class Deal:
         """One copy for all lanes; several for sums in order, on as many threads as :func:`threads_in_order` says."""
         lane_count = tracer.view.rays.lane_count
         if not in_order or not _is_dealt_out(tracer):
-            return Deal(Shares(), None, None, [])
+            return Deal(1, None, None, [])
         backend, packets = tracer.view.backend, -(-lane_count // (COPIES * _WIDEST_PACKET))
         lanes = min(_LANES_OF_A_LAUNCH // COPIES, packets * _WIDEST_PACKET)
         starts = [backend.constant(start) for start in range(0, lane_count, COPIES * lanes)]
-        return Deal(Shares(COPIES), backend.lanes(COPIES * lanes), backend.constant(lanes), starts)
+        return Deal(COPIES, backend.lanes(COPIES * lanes), backend.constant(lanes), starts)
 
     def trace(self, tracer: Tracer, run: Callable[[Tracer, Any | None], None]) -> None:
         """Run a kernel on all lanes.
@@ -85,4 +79,4 @@ def _is_dealt_out(tracer: Tracer) -> bool:
     view = tracer.view
     if view.backend.name != "llvm" or tracer.on_lanes(view.lane) is None:
         return False
-    return view.rays.lane_count <= _MOST_LAUNCHES * _LANES_OF_A_LAUNCH
+    return view.rays.lane_count <= _MOST_LAUNCHES * _LANES_OF_A_LAUNCH and dr.width(view.vertices) <= _MOST_FLOATS

@@ -15,19 +15,23 @@ class Copies:
     """Where the copies of a buffer are, in device values: kernels are the same for all lengths of it.
 
     Attributes:
+        count: Number of copies.
         lane: Numbers of the floats of one copy.
         floats: How many these are.
         records: How many records.
     """
 
+    count: int
     lane: Any
     floats: Any
     records: Any
 
     @staticmethod
-    def of(backend: Backend, floats: int, width: int) -> Copies:
-        """Copies of so many floats, in records of some width."""
-        return Copies(backend.lanes(floats), backend.constant(floats), backend.constant(floats // width))
+    def of(backend: Backend, count: int, floats: int, width: int) -> Copies | None:
+        """So many copies of some floats in records of some width; None where there is but one."""
+        if count == 1:
+            return None
+        return Copies(count, backend.lanes(floats), backend.constant(floats), backend.constant(floats // width))
 
 
 @dataclass
@@ -37,21 +41,20 @@ class Sums:
     Attributes:
         buffer: The records of all copies.
         copies: Where these are; None where there is one for all.
-        number: Number of them.
         copy: Which one each lane adds to.
         mode: How additions to one record are reduced.
     """
 
     buffer: Any
     copies: Copies | None
-    number: int
     copy: Any | None
     mode: dr.ReduceMode
 
     @staticmethod
-    def zeros(backend: Backend, floats: int, copies: Copies | None, number: int, mode: dr.ReduceMode) -> Sums:
+    def zeros(backend: Backend, floats: int, copies: Copies | None, mode: dr.ReduceMode) -> Sums:
         """Nothing yet, so many floats in each copy."""
-        return Sums(dr.zeros(backend.Float, number * floats), copies, number, None, mode)
+        count = 1 if copies is None else copies.count
+        return Sums(dr.zeros(backend.Float, count * floats), copies, None, mode)
 
     def of_copy(self, copy: Any | None) -> Sums:
         """The same for lanes that each add to a copy of their own."""
@@ -69,7 +72,7 @@ class Sums:
             return self.buffer
         real, place = type(self.buffer), self.copies.lane
         total = dr.gather(real, self.buffer, place)
-        for _ in range(1, self.number):
+        for _ in range(1, self.copies.count):
             place = place + self.copies.floats
             total += dr.gather(real, self.buffer, place)
         return total
