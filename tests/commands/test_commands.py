@@ -47,12 +47,27 @@ def test_fit_fills_its_folder(run):
 
 def test_eval_repeats_the_numbers_of_the_fit(run, tmp_path, capsys):
     output = tmp_path / "eval.json"
-    assert cli.main(["eval", str(run / "model.vtu"), "tooth", "-o", str(output), "--device", "cpu", *VIEWS]) == 0
+    assert cli.main(["eval", str(run / "model.vtu"), "-o", str(output), "--device", "cpu"]) == 0
     numbers = json.loads(output.read_text())
     metrics = json.loads((run / "metrics.json").read_text())
     assert numbers["psnr"] == pytest.approx(metrics["psnr"], abs=1e-3)
     assert numbers["ssim"] == pytest.approx(metrics["ssim"], abs=1e-3)
-    assert f"{metrics['psnr']:.2f}" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert f"{metrics['psnr']:.2f}" in said and f"Comparing with: tooth {' '.join(VIEWS)}" in said
+
+
+def test_eval_reads_a_capture_as_the_run_beside_the_model_did(run, tmp_path, capsys):
+    """If it is the same one, by whatever path; the command line wins, and a model alone knows nothing of any run."""
+    model, alone = run / "model.vtu", tmp_path / "model.vtu"
+    alone.write_bytes(model.read_bytes())
+    parsed = cli.parse_command(["eval", str(model), "tooth", "--width", "20", "--no-keep-lens"])
+    assert (parsed.capture, parsed.views_of.views, parsed.views_of.width) == ("tooth", 10, 20)
+    assert cli.parse_command(["eval", str(model), f"{tmp_path}/other.nrrd"]).views_of.views is None
+    assert cli.parse_command(["eval", str(alone), "tooth"]).views_of.views is None
+    assert "name CAPTURE" in fails(capsys, "eval", alone)
+    picture = str(tmp_path / "a.png")
+    assert cli.parse_command(["compare", "tooth", str(model), str(alone), "-o", picture]).views_of.views == 10
+    assert cli.parse_command(["compare", "tooth", str(alone), "-o", picture]).views_of.views is None
 
 
 def test_render_frames_the_mesh(run, tmp_path, capsys):
@@ -113,11 +128,27 @@ def test_resume_takes_the_options_of_the_run(run, tmp_path, capsys):
     folder.mkdir()
     for name in ("config.json", "checkpoint.safetensors"):
         (folder / name).write_bytes((run / name).read_bytes())
-    assert cli.main(["fit", "tooth", "-o", str(folder), "--resume"]) == 0
+    assert cli.main(["fit", "-o", str(folder), "--resume"]) == 0
     assert (folder / "model.vtu").read_bytes() == (run / "model.vtu").read_bytes()
     assert "cells = 500" in fails(capsys, "fit", "tooth", "-o", folder, "--resume", "--cells", "900")
     assert "other views" in fails(capsys, "fit", "tooth", "-o", folder, "--resume", "--width", "32")
     assert "fits 'tooth'" in fails(capsys, "fit", "molar.nrrd", "-o", folder, "--resume")
+
+
+def test_a_run_can_be_trained_longer(run, tmp_path, capsys):
+    folder = tmp_path / "out"
+    folder.mkdir()
+    for name in ("config.json", "checkpoint.safetensors"):
+        (folder / name).write_bytes((run / name).read_bytes())
+    done = json.loads((run / "metrics.json").read_text())["iterations"]
+    longer = ["fit", "-o", str(folder), "--resume", "--iterations", str(done + 2)]
+    assert cli.main(longer) == 0
+    assert json.loads((folder / "metrics.json").read_text())["iterations"] == done + 2
+    assert json.loads((folder / "config.json").read_text())["fit"]["iterations"] == done + 2
+    # It is the longer run now.
+    assert cli.main(["fit", "-o", str(folder), "--resume"]) == 0
+    said = fails(capsys, "fit", "-o", folder, "--resume", "--iterations", done)
+    assert f"has done {done + 2} iterations already, this one is to have {done}" in said
 
 
 def test_another_run_is_never_overwritten_unasked(run, tmp_path, capsys):

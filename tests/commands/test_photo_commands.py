@@ -127,8 +127,8 @@ def test_lenses_that_are_kept(tmp_path, capsys):
     assert saved["capture_options"] == {"downscale": 1, "keep_lens": True}
     metrics = json.loads((out / "metrics.json").read_text())
     model, ball = str(out / "model.vtu"), str(tmp_path / "ball")
-    assert cli.main(["eval", model, ball, "--keep-lens", "-o", str(tmp_path / "kept.json")]) == 0
-    assert cli.main(["eval", model, ball, "-o", str(tmp_path / "resampled.json")]) == 0
+    assert cli.main(["eval", model, "-o", str(tmp_path / "kept.json")]) == 0
+    assert cli.main(["eval", model, ball, "--no-keep-lens", "-o", str(tmp_path / "resampled.json")]) == 0
     kept, resampled = (json.loads((tmp_path / f"{name}.json").read_text())["psnr"] for name in ("kept", "resampled"))
     assert kept == pytest.approx(metrics["psnr"], abs=1e-4) and kept != pytest.approx(resampled, abs=1e-4)
     assert cli.main(["compare", ball, model, "-o", str(tmp_path / "sheet.png"), "--keep-lens", "--no-cut"]) == 0

@@ -141,9 +141,9 @@ def test_one_place_to_take_options_from(run, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("options", [[], ["--resume"], ["--config", "CONFIG"]])
-def test_a_capture_that_nothing_names_is_a_usage_error(run, tmp_path, capsys, options):
+def test_a_capture_that_nothing_names_is_a_usage_error(tmp_path, capsys, options):
     config = written(tmp_path / "fit.json", {"fit": {"cells": 500}})
-    args = ["fit", "-o", str(run), *(option.replace("CONFIG", str(config)) for option in options)]
+    args = ["fit", "-o", str(tmp_path / "new"), *(option.replace("CONFIG", str(config)) for option in options)]
     assert cli.main(args) == 2
     said = capsys.readouterr()
     assert "CAPTURE" in said.err + said.out

@@ -65,4 +65,4 @@ def test_interrupted_runs_tell_a_command_that_shells_understand(tmp_path, capsys
     assert cli.main(["fit", "tooth", "-o", str(folder), *VIEWS, *FIT]) == 130
     line = capsys.readouterr().out.strip()
     command = line.partition("continue with: ")[2]
-    assert shlex.split(command) == ["difftetvr", "fit", "tooth", "-o", str(folder), "--resume"]
+    assert shlex.split(command) == ["difftetvr", "fit", "-o", str(folder), "--resume"]

@@ -123,6 +123,19 @@ def test_resuming_a_finished_run_changes_nothing(small_capture, tmp_path):
     assert first.metrics == again.metrics
 
 
+def test_a_finished_run_goes_on_at_the_rates_of_a_longer_one(small_capture, tmp_path, monkeypatch):
+    config, path = FitConfig(cells=500, iterations=3, refine="none", device="cpu"), tmp_path / "c.safetensors"
+    first = fit(small_capture, config, checkpoint=path)
+    step, rates = FieldParameters.step, []
+    monkeypatch.setattr(FieldParameters, "step", lambda self, rate, haze: rates.append(rate) or step(self, rate, haze))
+    longer = dataclasses.replace(config, iterations=5)
+    second = fit(small_capture, longer, checkpoint=path, resume=True)
+    assert rates == [longer.rate_at(3), longer.rate_at(4)] and rates[0] > config.rate_at(2)
+    assert second.history.loss[:3] == first.history.loss and len(second.history.loss) == 5
+    with pytest.raises(FitError, match="has done 5 iterations already, this one is to have 4"):
+        fit(small_capture, dataclasses.replace(config, iterations=4), checkpoint=path, resume=True)
+
+
 def test_resume_refuses_other_options_and_other_images(small_capture, tmp_path):
     config = FitConfig(cells=500, iterations=3, device="cpu")
     path = tmp_path / "c.safetensors"

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import json
+import shlex
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
+import tyro
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from difftetvr.cli.arguments import Groups
 from difftetvr.cli.options import CAPTURE_GROUPS, CaptureOptions, Color, MeshOptions, TrustOptions, color_of, load_model
+from difftetvr.cli.parsing import parse_if_valid
+from difftetvr.cli.saved import run_behind
 from difftetvr.errors import FitError
 from difftetvr.files import require_writable
 from difftetvr.fitting.records.folder import RunFolder, write_json
@@ -26,15 +31,16 @@ class Eval:
 
     model: Annotated[Path, Positional, arg(metavar="MODEL")]
     """Mesh with color and density."""
-    capture: Annotated[str, Positional, arg(metavar="CAPTURE")]
-    """What it was fitted to: tooth, or the path of a volume, of photographs or of a saved capture (.npz), with the
-    options by which it was read."""
+    capture: Annotated[str | None, Positional, arg(metavar="CAPTURE")] = None
+    """What it was fitted to: tooth, or the path of a volume, of photographs or of a saved capture (.npz). May be left
+    out beside the config.json of the model's run, whose options are then those that are not given here."""
     output: Annotated[Path | None, arg(aliases=["-o"])] = None
     """File to write the numbers to, JSON."""
     all_views: bool = False
     """Compare with the training views, too."""
     background: Color | None = None
-    """Behind the volume: black, white or R G B; default: white for photographs that alpha cuts out, else black."""
+    """Behind the volume: black, white or R G B; default: that of the run, else white for photographs that alpha cuts
+    out, black for all others."""
     device: str | None = None
     """Where to render."""
     views_of: OmitArgPrefixes[CaptureOptions] = field(default_factory=CaptureOptions)
@@ -46,11 +52,15 @@ class Eval:
         from difftetvr.fitting.records.evaluation import evaluate, usual_background
         from difftetvr.view.describe import evaluation_table
 
+        if self.capture is None:
+            raise FitError(f"No config.json of a run lies beside {self.model} and says what it fits; name CAPTURE.")
         if self.output is not None:
             require_writable(self.output, FitError)
         given = None if self.background is None else color_of(self.background)
         mesh, field_on_mesh = load_model(self.model, self.device, console=console)
-        capture = self.views_of.sized_for(self.capture, self.device, console).load(self.capture, console)
+        views_of = self.views_of.sized_for(self.capture, self.device, console)
+        console.print(f"Comparing with: {shlex.join([self.capture, *views_of.in_words()])}", highlight=False)
+        capture = views_of.load(self.capture, console)
         background = usual_background(capture) if given is None else given
         views = list(range(len(capture.cameras))) if self.all_views else capture.test_indices.tolist()
         if not views:
@@ -59,6 +69,16 @@ class Eval:
         console.print(evaluation_table(evaluation))
         if self.output is not None:
             write_json(self.output, evaluation.to_json())
+
+    @staticmethod
+    def defaults(args: Sequence[str]) -> Eval | None:
+        """The command as the run beside the model would be evaluated; None: as declared."""
+        model: Any = tyro.MISSING
+        given = parse_if_valid(Eval, "eval", args, Eval(model))
+        run = None if given is None else run_behind(given.model, given.capture)
+        if run is None:
+            return None
+        return Eval(model, run.capture, background=run.fit.evaluation_background(), views_of=run.capture_options)
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,7 @@ class Fit:
     capture: Annotated[str, Positional, arg(metavar="CAPTURE")]
     """What to fit: tooth (the built-in CT scan), or the path of a volume, of photographs with their cameras
     (NeRF-synthetic, transforms.json, COLMAP, cameras.json), or of a saved capture (.npz). May be left out where
-    --config names it."""
+    --config names it, and with --resume."""
     output: Annotated[Path, arg(aliases=["-o"], metavar="OUT")]
     """Folder for the model, its metrics, pictures and checkpoint."""
     config: Annotated[FitConfig, arg(name="")] = field(default_factory=FitConfig)
@@ -45,7 +45,8 @@ class Fit:
     """Take the options that are not given, and CAPTURE, from this file: the config.json of another run, or any part of
     one."""
     resume: bool = False
-    """Go on with the run in the output folder; options that are not given are taken from it."""
+    """Go on with the run in the output folder, with more --iterations beyond its end; CAPTURE and options that are not
+    given are taken from it."""
     overwrite: bool = False
     """Replace the run in the output folder."""
     trust: OmitArgPrefixes[TrustOptions] = field(default_factory=TrustOptions)
@@ -101,7 +102,7 @@ class Fit:
             with ProgressDisplay(console) as display:
                 return optimise(trainer, folder.checkpoint, display)
         except KeyboardInterrupt:
-            command = shlex.join(["difftetvr", "fit", self.capture, "-o", str(self.output), "--resume"])
+            command = shlex.join(["difftetvr", "fit", "-o", str(self.output), "--resume"])
             console.print(f"Interrupted; continue with: {command}")
             raise
 
@@ -126,7 +127,7 @@ class Fit:
         saved = SavedRun.in_folder(folder) if self.resume else None
         if saved is None:
             return
-        if saved.capture != self.capture:
+        if not saved.is_of(self.capture):
             raise FitError(
                 f"The run in {self.output} fits '{saved.capture}', not '{self.capture}'; "
                 "resume with the same capture or choose another folder."

@@ -130,6 +130,14 @@ class CaptureOptions:
         values = ((item, getattr(self, item.name)) for item in dataclasses.fields(self))
         return {item.name: value for item, value in values if value != item.default}
 
+    def in_words(self) -> list[str]:
+        """Those that are given, as words of a command line."""
+        words = []
+        for name, value in self.given().items():
+            values = value if isinstance(value, tuple) else () if value is True else (value,)
+            words += [f"--{name.replace('_', '-')}", *map(str, values)]
+        return words
+
     def load(self, name: str, console: Console) -> Capture:
         """Reads or renders the capture of that name."""
         from difftetvr.capture import load_capture

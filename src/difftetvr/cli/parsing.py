@@ -58,6 +58,14 @@ def parse(kind: type, name: str, args: Sequence[str], default: Any = None) -> An
             raise FitError(_mistake(program, list(arguments_of(kind, default)), words, default is not None)) from None
 
 
+def parse_if_valid(kind: type, name: str, args: Sequence[str], default: Any) -> Any | None:
+    """As `parse` does; None where that raises an error, for whoever parses again and will say it."""
+    try:
+        return parse(kind, name, args, default)
+    except FitError:
+        return None
+
+
 def _mistake(program: str, arguments: list[Argument], words: Sequence[str], pairs: bool) -> str:
     """A sentence about the first of the words that cannot be understood, or about what is missing.
 

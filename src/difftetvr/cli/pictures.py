@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
+import tyro
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from difftetvr.cli.arguments import Groups
@@ -19,6 +21,8 @@ from difftetvr.cli.options import (
     color_of,
     load_model,
 )
+from difftetvr.cli.parsing import parse_if_valid
+from difftetvr.cli.saved import run_behind
 from difftetvr.errors import CaptureError, counted
 from difftetvr.files import require_writable
 
@@ -33,7 +37,8 @@ class Compare:
     """Draw held-out views of a capture beside those of models, with PSNR, and a cut through each model."""
 
     capture: Annotated[str, Positional, arg(metavar="CAPTURE")]
-    """What they were fitted to: tooth, or the path of a volume, of photographs or of a saved capture (.npz)."""
+    """What they were fitted to: tooth, or the path of a volume, of photographs or of a saved capture (.npz). Options of
+    how it is read that are not given are those of the models' runs, where these agree."""
     models: Annotated[tuple[Path, ...], Positional, arg(metavar="MODEL")]
     """Meshes with color and density."""
     output: Output
@@ -78,6 +83,15 @@ class Compare:
         plane = None if self.no_cut else Plane(self.normal)
         save_picture(self.output, compare_models(capture, models, self.rows, plane, background))
         console.print(f"Wrote {self.output}")
+
+    @staticmethod
+    def defaults(args: Sequence[str]) -> Compare | None:
+        """The command with the views as the runs beside the models have them; None: as declared, or they differ."""
+        absent: Any = tyro.MISSING
+        given = parse_if_valid(Compare, "compare", args, Compare(absent, absent, absent))
+        found = () if given is None else (run_behind(model, given.capture) for model in given.models)
+        ways = {run.capture_options for run in found if run is not None}
+        return Compare(absent, absent, absent, views_of=ways.pop()) if len(ways) == 1 else None
 
 
 @dataclass(frozen=True)

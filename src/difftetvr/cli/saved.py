@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,6 +37,12 @@ class SavedRun:
     capture_options: CaptureOptions
     fit: FitConfig
     repair: str | None = None
+
+    def is_of(self, capture: str | None) -> bool:
+        """Whether the run fits the capture of a name, which may be another path of the same files; None: any."""
+        if self.capture is None or capture is None:
+            return self.capture is not None
+        return os.path.realpath(self.capture) == os.path.realpath(capture)
 
     @staticmethod
     def in_folder(folder: RunFolder) -> SavedRun | None:
@@ -93,11 +99,7 @@ def saved_run(args: Sequence[str]) -> SavedRun | None:
         if origin.resume:
             raise FitError("--resume goes on with the options of the run itself; leave out --config, or --resume.")
         return SavedRun.in_file(origin.config)
-    saved = SavedRun.in_folder(RunFolder(origin.output)) if origin.resume and origin.output is not None else None
-    if saved is None:
-        return None
-    # Whoever resumes names the capture again, which shows that this is the run they mean.
-    return dataclasses.replace(saved, capture=None)
+    return SavedRun.in_folder(RunFolder(origin.output)) if origin.resume and origin.output is not None else None
 
 
 def saved_beside(model: Path) -> SavedRun | None:
@@ -109,6 +111,17 @@ def saved_beside(model: Path) -> SavedRun | None:
         return SavedRun.in_folder(folder)
     except DiffTetError:
         return None
+
+
+def run_behind(model: Path, capture: str | None) -> SavedRun | None:
+    """The run that a model is the result of, if it fits the capture of a name; None where that is not known.
+
+    Args:
+        model: The model's file.
+        capture: Name of the capture; None: whichever it is.
+    """
+    run = saved_beside(model)
+    return run if run is not None and run.is_of(capture) else None
 
 
 def _read(path: Path, base: dict[str, Any], refusal: str) -> SavedRun:

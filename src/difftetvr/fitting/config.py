@@ -59,8 +59,8 @@ _CHOICES_FOR_VOLUMES: dict[str, Any] = {
 CHOSEN_FOR_CAPTURE = tuple(_CHOICES_FOR_VOLUMES)
 """Options whose default depends on the images."""
 
-# Options that change nothing about where the optimisation goes: a resumed run may choose them anew.
-_FREE_OPTIONS = frozenset({"device", "evaluate_every", "checkpoint_seconds"})
+# What a resumed run may choose anew: what changes nothing about where the optimisation goes, and how far it goes.
+_FREE_OPTIONS = frozenset({"device", "evaluate_every", "checkpoint_seconds", "iterations"})
 
 
 @dataclass(frozen=True)
@@ -279,7 +279,7 @@ class FitConfig:
         return self.background
 
     def require_same_run(self, other: FitConfig) -> None:
-        """Checks that ``other`` would take the same steps as these options of a saved run.
+        """Checks that ``other`` would take the same steps as these options of a saved run, were it of the same length.
 
         Raises:
             FitError: An option that decides the steps differs; names the first one.

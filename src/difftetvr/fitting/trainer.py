@@ -152,10 +152,15 @@ class Trainer:
     ) -> Trainer:
         """Goes on from a checkpoint.
 
+        With more or fewer iterations than its run was to have, rates go on as they would at this point of such a run.
+
         Raises:
-            FitError: The checkpoint is of a run with other options or images, or lacks something.
+            FitError: The checkpoint is of a run with other options or images, lacks something, or has come further than
+                the options ask for.
         """
-        checkpoint.config.require_same_run(config.for_capture(capture))
+        asked = config.for_capture(capture)
+        checkpoint.config.require_same_run(asked)
+        checkpoint.require_not_beyond(asked.steps)
         trainer = Trainer(capture, config, checkpoint.mesh(), strategy)
         require_same_capture(checkpoint.capture, trainer._capture_description)
         checkpoint.require_strategy(type(trainer.strategy).__name__)

@@ -127,6 +127,21 @@ class Checkpoint:
         except (KeyError, MeshError) as error:
             raise _unreadable(self.source, _reason(error)) from error
 
+    def require_not_beyond(self, steps: int) -> None:
+        """Checks that the run has not come further than it is to go.
+
+        Args:
+            steps: Iterations that it is to have.
+
+        Raises:
+            FitError: It has.
+        """
+        if self.iteration > steps:
+            raise FitError(
+                f"The saved run has done {self.iteration} iterations already, this one is to have {steps}; resume with "
+                "at least as many, or start anew."
+            )
+
     def require_strategy(self, current: str) -> None:
         """Checks that the run goes on with the kind of strategy that it began with.
 
