@@ -55,7 +55,11 @@ def measure(cells: int, size: int, iterations: int) -> dict[str, float]:
         row["next iteration s"] = time.perf_counter() - before
     changed = trainer.history.refinements[-1]
     moved = changed.removed + changed.added + changed.flipped
-    return row | {"cells": trainer.mesh.num_cells, "changes": moved, "error": changed.error_after / changed.error_before}
+    return row | {
+        "cells": trainer.mesh.num_cells,
+        "changes": moved,
+        "error": changed.error_after / changed.error_before,
+    }
 
 
 def main() -> None:

@@ -126,14 +126,13 @@ class Backend:
         return tensor.view(shape) if shape else tensor
 
     @contextmanager
-    def exclusive(self, in_order: bool = False, threads_in_order: int = 1) -> Iterator[None]:
+    def exclusive(self, in_order: bool = False) -> Iterator[None]:
         """Run kernels while no other Python thread does.
 
         Dr.Jit's pool of threads is one a process, and kernels use all of it, so renderings take turns.
 
         Args:
             in_order: Whether sums over rays are taken in a fixed order. GPUs cannot: their atomic additions have none.
-            threads_in_order: CPU threads that kernels then run on.
 
         Raises:
             BackendError: This process was forked from one that had run kernels.
@@ -150,16 +149,21 @@ class Backend:
         with _TURN:
             # Values of the forward pass may be asked for by autograd's thread, which Dr.Jit must be told of.
             dr.detail.new_scope(dr.backend_v(self.Float))
-            threads = dr.thread_count()
-            changes_threads = in_order and self.name == "llvm" and threads != threads_in_order
-            if changes_threads:
-                dr.set_thread_count(threads_in_order)
-            try:
-                yield
-            finally:
-                if changes_threads:
-                    dr.sync_thread()
-                    dr.set_thread_count(threads)
+            yield
+
+    @contextmanager
+    def on_threads(self, count: int | None) -> Iterator[None]:
+        """Run kernels on so many CPU threads; None: as many as there are."""
+        threads = dr.thread_count()
+        if count is None or count == threads:
+            yield
+            return
+        dr.set_thread_count(count)
+        try:
+            yield
+        finally:
+            dr.sync_thread()
+            dr.set_thread_count(threads)
 
     @property
     def _is_on_default_stream(self) -> bool:

@@ -84,10 +84,11 @@ def test_images(make_field: Callable[[TetMesh], tuple[Any, list[torch.Tensor]]],
     assert_in_order(lambda in_order: image_gradients(make_field, view, in_order))
 
 
-def test_meshes_too_large_for_copies(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("budget", [1, 90_000])
+def test_meshes_too_large_for_so_many_copies(monkeypatch: pytest.MonkeyPatch, budget: int) -> None:
     assert_in_order(lambda in_order: image_gradients(vertex_field, CAMERA, in_order))
     in_copies = image_gradients(vertex_field, CAMERA, True)
-    monkeypatch.setattr(shares, "_MOST_FLOATS", 1)
+    monkeypatch.setattr(shares, "_COPIES_BUDGET", budget)
     assert_in_order(lambda in_order: image_gradients(vertex_field, CAMERA, in_order))
     for one, other in zip(in_copies, image_gradients(vertex_field, CAMERA, True), strict=True):
         assert float((one - other).norm()) <= 1e-12 * float(one.norm())

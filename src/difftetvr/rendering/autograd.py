@@ -16,7 +16,6 @@ from difftetvr.rendering.kernels.composition import Composition, Pixels
 from difftetvr.rendering.kernels.forward import render_forward
 from difftetvr.rendering.kernels.gradients import Gradients, Wanted
 from difftetvr.rendering.kernels.layout import GradientSource, collect
-from difftetvr.rendering.kernels.shares import threads_in_order
 from difftetvr.rendering.search.memory_order import MemoryOrder
 from difftetvr.rendering.task import RenderTask
 from difftetvr.rendering.traversal.crossing import Tracer
@@ -62,7 +61,7 @@ class RenderFunction(torch.autograd.Function):
         needs_vertices, needs_pose, needs_background, needs_limits, needs_lines = ctx.needs_input_grad[2:7]
         wanted = Wanted(needs_vertices or needs_pose, needs_limits, needs_lines)
         derivatives = [None if part is None or not part.numel() else backend.floats(part) for part in by_image]
-        with with_flags(ctx.flags), backend.exclusive(task.deterministic, threads_in_order(shot.tracer)):
+        with with_flags(ctx.flags), backend.exclusive(task.deterministic):
             image = ImageAdjoint(Pixels(*derivatives), ctx.how, *ctx.gathered)
             gradients = render_adjoint(shot.tracer, image, task.mesh.num_vertices, wanted, task.deterministic)
             geometry, parts = gradient_tensors(task, gradients, pose, vertices)

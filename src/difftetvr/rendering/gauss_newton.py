@@ -15,7 +15,6 @@ from difftetvr.rendering.api import as_background
 from difftetvr.rendering.kernels.composition import Composition
 from difftetvr.rendering.kernels.forward import render_forward
 from difftetvr.rendering.kernels.hats import RECORD, STEP_RECORD, HatImage, hat_records
-from difftetvr.rendering.kernels.shares import threads_in_order
 from difftetvr.rendering.preparation import ViewOptions, prepare_view
 from difftetvr.rendering.rays import Rays, RaySource
 
@@ -239,7 +238,7 @@ def model_image(
     behind = as_background(background, mesh.vertices)
     backend = view.task.backend
     tracer = view.tracer(view.limits(None))
-    with backend.exclusive(deterministic, threads_in_order(tracer)):
+    with backend.exclusive(deterministic):
         how = Composition(None if behind is None else backend.floats(behind), None, view.unit)
         rendered = render_forward(tracer, how)
         image = backend.tensor(rendered.image.color, *truth.shape)

@@ -15,7 +15,6 @@ from difftetvr.rendering.traversal.sums import Copies, Sums
 from difftetvr.rendering.traversal.transfer import TransferGradients
 
 _POSITION = 4  # floats of a record of a position
-_EXPAND_BUDGET = 1 << 30  # bytes of per-thread gradient copies; beyond it threads share one copy through atomics
 
 
 @dataclass(frozen=True)
@@ -63,16 +62,19 @@ class GradientSums:
     lines: Any | None
 
     @staticmethod
-    def zeros(backend: Backend, sizes: BufferSizes, copies: Sequence[Copies | None]) -> GradientSums:
+    def zeros(
+        backend: Backend, sizes: BufferSizes, copies: Sequence[Copies | None], mode: dr.ReduceMode
+    ) -> GradientSums:
         """Buffers of some sizes.
 
         Args:
             backend: Array types.
             sizes: The sizes.
             copies: What :meth:`BufferSizes.places` says about them.
+            mode: How additions of several rays to one record are reduced.
         """
         field, cells, vertices, knots, values = (
-            None if size is None else Sums.zeros(backend, size, places, sizes.mode)
+            None if size is None else Sums.zeros(backend, size, places, mode)
             for size, places in zip(sizes.summed, copies, strict=True)
         )
         return GradientSums(
@@ -108,8 +110,6 @@ class BufferSizes:
 
     Attributes:
         width: Floats in a record of ``field`` and ``cells``.
-        copies: Number of copies of the buffers.
-        mode: How additions of several rays to one record are reduced.
     """
 
     field: int | None
@@ -120,11 +120,9 @@ class BufferSizes:
     limits: int | None
     lines: int | None
     width: int
-    copies: int
-    mode: dr.ReduceMode
 
     @staticmethod
-    def of(view: View, vertex_count: int, wanted: Wanted, copies: int) -> BufferSizes:
+    def of(view: View, vertex_count: int, wanted: Wanted) -> BufferSizes:
         """Sizes for a view of V vertices; few different ones, for kernels are compiled for them."""
         transfer = view.transfer
         width = view.records.width if view.has_vertex_channels or view.cells is not None else 1
@@ -142,8 +140,6 @@ class BufferSizes:
             limits=2 * view.rays.count if wanted.limits else None,
             lines=6 * view.rays.count if wanted.lines else None,
             width=width,
-            copies=copies,
-            mode=reduce_mode(view, sum(size or 0 for size in (field, cells, vertices)), copies),
         )
 
     @property
@@ -151,17 +147,12 @@ class BufferSizes:
         """Sizes of the buffers that many rays add to."""
         return self.field, self.cells, self.vertices, self.knots, self.values
 
-    def places(self, backend: Backend) -> list[Copies | None]:
-        """Where the copies of these are; None where there is but one."""
+    @property
+    def floats(self) -> int:
+        """Sum of these sizes."""
+        return sum(size or 0 for size in self.summed)
+
+    def places(self, backend: Backend, copies: int) -> list[Copies | None]:
+        """Where so many copies of these are; None where there is but one."""
         pairs = zip(self.summed, (self.width, self.width, _POSITION, 1, 1), strict=True)
-        return [None if size is None else Copies.of(backend, self.copies, size, width) for size, width in pairs]
-
-
-def reduce_mode(view: View, floats: int, copies: int) -> dr.ReduceMode:
-    """On CPUs one gradient copy a thread beats atomics, as long as the copies fit a budget."""
-    if copies > 1:
-        return dr.ReduceMode.NoConflicts
-    if view.backend.name != "llvm":
-        return dr.ReduceMode.Auto
-    size = floats * (8 if view.backend.is_double else 4) * dr.thread_count()
-    return dr.ReduceMode.Expand if size <= _EXPAND_BUDGET else dr.ReduceMode.Local
+        return [None if size is None else Copies.of(backend, copies, size, width) for size, width in pairs]

@@ -24,7 +24,6 @@ import drjit as dr
 
 from difftetvr.mesh import TetMesh
 from difftetvr.recording import few_lengths, replayed
-from difftetvr.rendering.kernels.gradients import reduce_mode
 from difftetvr.rendering.kernels.hat_tables import HatTables, RankedCell, ranks_of
 from difftetvr.rendering.kernels.shares import Deal
 from difftetvr.rendering.search.memory_order import MemoryOrder
@@ -149,31 +148,28 @@ def hat_records(
         image: The rendered image, and the derivative of the loss with respect to it.
         in_order: Whether sums over rays have a certain order, see :mod:`difftetvr.rendering.kernels.shares`.
     """
-    view, topology, deal = tracer.view, mesh.topology, Deal.of(tracer, in_order)
+    view, topology = tracer.view, mesh.topology
     counts = [few_lengths(n) for n in (mesh.num_vertices, topology.edges.shape[0], topology.faces.shape[0])]
     widths = [RECORD, RECORD, RECORD if image.face_steps is None else STEP_RECORD]
     sizes = [count * width for count, width in zip(counts, widths, strict=True)]
-    mode = reduce_mode(view, sum(sizes), deal.copies)
-    pairs = zip(sizes, widths, strict=True)
-    copies = [Copies.of(view.backend, deal.copies, size, width) for size, width in pairs]
-    records: HatRecords = replayed(
-        _records, tracer, HatTables.of(view, mesh, order), image, deal, _Buffers(sizes, mode, copies)
-    )
+    deal, pairs = Deal.of(tracer, sum(sizes), in_order), zip(sizes, widths, strict=True)
+    buffers = _Buffers(sizes, [Copies.of(view.backend, deal.copies, size, width) for size, width in pairs])
+    with view.backend.on_threads(deal.threads):
+        records: HatRecords = replayed(_records, tracer, HatTables.of(view, mesh, order), image, deal, buffers)
     return records
 
 
 @dataclass
 class _Buffers:
-    """Numbers of floats, how additions are reduced, and where copies are; None where there is but one."""
+    """Numbers of floats, and where copies are; None where there is but one."""
 
     sizes: list[int]
-    mode: dr.ReduceMode
     copies: list[Copies | None]
 
 
 def _records(tracer: Tracer, tables: HatTables, image: HatImage, deal: Deal, buffers: _Buffers) -> HatRecords:
     backend, pairs = tracer.view.backend, zip(buffers.sizes, buffers.copies, strict=True)
-    parts = [Sums.zeros(backend, size, copies, buffers.mode) for size, copies in pairs]
+    parts = [Sums.zeros(backend, size, copies, deal.mode) for size, copies in pairs]
     sums = _HatSums(*parts)
 
     def run(part: Tracer, copy: Any | None) -> None:

@@ -127,14 +127,15 @@ def depths_adjoint(
         wanted: What needs gradients beside the field.
         in_order: Whether sums over rays have a certain order, see :mod:`difftetvr.rendering.kernels.shares`.
     """
-    deal = Deal.of(tracer, in_order)
-    sizes = BufferSizes.of(tracer.view, vertex_count, wanted, deal.copies)
-    gradients: Gradients = replayed(_adjoint, tracer, depths, deal, sizes, sizes.places(tracer.view.backend))
+    backend, sizes = tracer.view.backend, BufferSizes.of(tracer.view, vertex_count, wanted)
+    deal = Deal.of(tracer, sizes.floats, in_order)
+    with backend.on_threads(deal.threads):
+        gradients: Gradients = replayed(_adjoint, tracer, depths, deal, sizes, sizes.places(backend, deal.copies))
     return gradients
 
 
 def _adjoint(tracer: Tracer, depths: Weighed, deal: Deal, sizes: BufferSizes, copies: list[Copies | None]) -> Gradients:
-    sums = GradientSums.zeros(tracer.view.backend, sizes, copies)
+    sums = GradientSums.zeros(tracer.view.backend, sizes, copies, deal.mode)
 
     def run(part: Tracer, copy: Any | None) -> None:
         part.trace(lambda rays: _DepthsAdjoint(part, rays, depths, sums.of_copy(copy)))

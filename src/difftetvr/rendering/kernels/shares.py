@@ -17,12 +17,12 @@ import drjit as dr
 
 from difftetvr.rendering.traversal.crossing import Tracer
 
-COPIES = 8
-"""Twice the threads that take part: more copies would let more of them, but take longer to add up."""
-
 _MOST_LANES = 2 * 2 * 16384
 _WIDEST_PACKET = 16
-_MOST_FLOATS = 1 << 22  # of vertex records: the copies of what refinements are predicted from then take some 2 GB
+_COPIES = 8, 4
+"""Twice the threads that take part: more copies would let more of them, but take longer to add up."""
+_COPIES_BUDGET = 1 << 32  # bytes; the sums of a mesh for which four copies take more have a thread to themselves
+_EXPAND_BUDGET = 1 << 30  # bytes of one copy a thread; beyond it threads share one through atomics
 
 
 @dataclass
@@ -31,26 +31,38 @@ class Deal:
 
     Attributes:
         copies: Number of copies.
+        mode: How additions to one copy are reduced.
+        threads: CPU threads on which sums have their order; None: any, or there is no order.
         lane: Numbers of the kernel's lanes; None where each ray has its own, and all add to one copy.
         lanes_of_a_copy: How many of them add to each copy.
         turns: Rays that a lane takes, one after the other.
     """
 
     copies: int
-    lane: Any | None
-    lanes_of_a_copy: Any | None
-    turns: Any | None
+    mode: dr.ReduceMode
+    threads: int | None
+    lane: Any | None = None
+    lanes_of_a_copy: Any | None = None
+    turns: Any | None = None
 
     @staticmethod
-    def of(tracer: Tracer, in_order: bool) -> Deal:
-        """One copy for all rays; several for sums in order, on as many threads as :func:`threads_in_order` says."""
-        ray_count = tracer.view.rays.lane_count
-        if not in_order or not _is_dealt_out(tracer):
-            return Deal(1, None, None, None)
-        backend, packets = tracer.view.backend, -(-ray_count // (COPIES * _WIDEST_PACKET))
-        lanes = min(_MOST_LANES // COPIES, packets * _WIDEST_PACKET)
-        turns = -(-ray_count // (COPIES * lanes))
-        return Deal(COPIES, backend.lanes(COPIES * lanes), backend.constant(lanes), backend.constant(turns))
+    def of(tracer: Tracer, floats: int, in_order: bool) -> Deal:
+        """A deal for so many floats that are added to; a copy of them for each thread and more where order matters."""
+        view = tracer.view
+        backend, size = view.backend, floats * (8 if view.backend.is_double else 4)
+        if backend.name != "llvm":
+            return Deal(1, dr.ReduceMode.Auto, None)
+        copies = next((n for n in _COPIES if n * size <= _COPIES_BUDGET), 1)
+        if in_order and (copies == 1 or tracer.on_lanes(view.lane) is None):
+            return Deal(1, _mode_of_one(size), 1)
+        if not in_order:
+            return Deal(1, _mode_of_one(size * dr.thread_count()), None)
+        threads = 1 << (min(dr.thread_count(), copies // 2).bit_length() - 1)
+        packets = -(-view.rays.lane_count // (copies * _WIDEST_PACKET))
+        lanes = min(_MOST_LANES // copies, packets * _WIDEST_PACKET)
+        turns = -(-view.rays.lane_count // (copies * lanes))
+        numbers = backend.lanes(copies * lanes), backend.constant(lanes), backend.constant(turns)
+        return Deal(copies, dr.ReduceMode.NoConflicts, threads, *numbers)
 
     def trace(self, tracer: Tracer, run: Callable[[Tracer, Any | None], None]) -> None:
         """Run a kernel on all rays.
@@ -75,15 +87,5 @@ class Deal:
         dr.while_loop((dr.zeros_like(first),), lambda turn: turn < self.turns, take)
 
 
-def threads_in_order(tracer: Tracer) -> int:
-    """Threads for kernels whose sums shall have an order: a power of two, and one where rays cannot be dealt out."""
-    if not _is_dealt_out(tracer):
-        return 1
-    return 1 << (min(dr.thread_count(), COPIES // 2).bit_length() - 1)
-
-
-def _is_dealt_out(tracer: Tracer) -> bool:
-    view = tracer.view
-    if view.backend.name != "llvm" or tracer.on_lanes(view.lane) is None:
-        return False
-    return dr.width(view.vertices) <= _MOST_FLOATS
+def _mode_of_one(size: int) -> dr.ReduceMode:
+    return dr.ReduceMode.Expand if size <= _EXPAND_BUDGET else dr.ReduceMode.Local

@@ -11,7 +11,6 @@ from torch.autograd.function import once_differentiable
 from difftetvr.rendering.autograd import gradient_tensors
 from difftetvr.rendering.kernels.gradients import Wanted
 from difftetvr.rendering.kernels.profile import Table, Weighed, ask_depths, ask_distances, depths_adjoint
-from difftetvr.rendering.kernels.shares import threads_in_order
 from difftetvr.rendering.preparation import PreparedView
 from difftetvr.rendering.task import RenderTask
 from difftetvr.rendering.traversal.crossing import Tracer
@@ -93,7 +92,7 @@ class _ProfileFunction(torch.autograd.Function):
         if not (wanted.vertices or wanted.limits or wanted.lines or any(needs_parts)):
             return *(None for _ in range(7)), questions, *(None for _ in needs_parts)
         ahead = weights.flip(1).cumsum(1).flip(1)
-        with backend.exclusive(task.deterministic, threads_in_order(ctx.tracer)):
+        with backend.exclusive(task.deterministic):
             depths = Weighed(*(_table(backend, values) for values in (distances, weights, ahead)))
             gradients = depths_adjoint(ctx.tracer, depths, task.mesh.num_vertices, wanted, task.deterministic)
             geometry, parts = gradient_tensors(task, gradients, pose, vertices)
