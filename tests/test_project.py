@@ -167,7 +167,7 @@ def test_no_test_module_is_imported():
 
 
 def test_files_stay_short():
-    scripts = [*(ROOT / "scripts").iterdir(), *(ROOT / "examples").glob("*.py"), *(ROOT / "benchmarks").glob("*.py")]
+    scripts = [*(ROOT / "scripts").iterdir(), *(ROOT / "examples").glob("*.py"), *(ROOT / "benchmarks").rglob("*.py")]
     tools = [file for kind in ("py", "c", "cpp", "h") for file in (ROOT / "tools").rglob(f"*.{kind}")]
     files = [*SOURCES, *(ROOT / "tests").rglob("*.py"), *tools, *(file for file in scripts if file.is_file())]
     lengths = {file.relative_to(ROOT): len(file.read_text(encoding="utf-8").splitlines()) for file in files}
