@@ -54,16 +54,16 @@ class Settings:
         random_background: Whether every ray has a background of its own, where alpha is known.
     """
 
-    stages: tuple[tuple[float, int], ...] = ((0.0, 64), (0.05, 128), (0.2, 192))
-    prunings: tuple[float, ...] = (0.02, 0.35, 0.6)
+    stages: tuple[tuple[float, int], ...] = ((0.0, 64), (0.15, 128), (0.4, 192))
+    prunings: tuple[float, ...] = (0.1, 0.3, 0.6)
     degree: int = 2
     step: float = 0.5
-    batch: int = 8192
-    color_rate: tuple[float, float] = (0.02, 0.001)
+    batch: int = 4096
+    color_rate: tuple[float, float] = (0.03, 0.001)
     density_rate: tuple[float, float] = (1.0, 0.05)
     decay: float = 0.95
-    color_variation: float = 1e-3
-    density_variation: float = 1e-4
+    color_variation: float = 1e-4
+    density_variation: float = 1e-5
     varied: float = 0.1
     first_density: float = 0.1
     least_weight: float = 0.005
