@@ -28,12 +28,14 @@ import difftetvr as dtv
 from difftetvr.capture import Capture
 from difftetvr.fitting.loop import prepare
 from difftetvr.fitting.records.evaluation import evaluate
-from difftetvr.fitting.refinement import Moment
+from difftetvr.fitting.refinement import Exchange
 
 MOMENTS = (0.02, 0.04, 0.07, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 """Shares of the time at which held-out views are looked at."""
 PILOT_ITERATIONS, PILOT_OF = 170, 2400
 """Iterations of the run that says how long one takes, the first ones of a run of so many."""
+ITERATIONS_PER_ROUND = 60
+"""Iterations of the mesh from one refinement to the next."""
 KEPT_ASIDE = 10
 """One training view of so many is a validation view."""
 LABELS = {"voxels": "voxel grid, as Plenoxels", "mesh": "tetrahedral mesh, dtv.fit"}
@@ -66,7 +68,7 @@ def voxels(capture: Capture, seconds: float) -> Curve:
 def mesh(capture: Capture, seconds: float, iterations: int | None) -> Curve:
     """Seconds, and PSNR in dB, of a mesh."""
     iterations = iterations or mesh_iterations(capture, seconds)
-    trainer = prepare(capture, dtv.FitConfig(evaluate_every=0, iterations=iterations))
+    trainer = prepare(capture, mesh_config(iterations))
     waiting, spent, curve = [share * iterations for share in MOMENTS], 0.0, []
     background = trainer.config.evaluation_background()
     for iteration in range(iterations):
@@ -94,17 +96,13 @@ def mesh_iterations(capture: Capture, seconds: float) -> int:
         trainer.step()
         taken[len(trainer.history.refinements) > rounds].append(time.perf_counter() - start)
     step, refinement = statistics.median(taken[False]), statistics.median(taken[True])
-    budget, strategy = trainer.budget, trainer.strategy
+    return max(1, int(seconds / (step + (refinement - step) / ITERATIONS_PER_ROUND)))
 
-    def total(iterations: int) -> float:
-        moments = (Moment(k, iterations, 1, trainer.mesh.num_cells, budget) for k in range(iterations))
-        return iterations * step + (refinement - step) * sum(strategy.is_due(moment) for moment in moments)
 
-    low, high = 1, 2 + int(seconds / step)
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (middle, high) if total(middle) <= seconds else (low, middle)
-    return low
+def mesh_config(iterations: int) -> dtv.FitConfig:
+    """The default options with as many refinements an iteration as long runs have; short ones have more by default."""
+    rounds = max(1, iterations // ITERATIONS_PER_ROUND)
+    return dtv.FitConfig(evaluate_every=0, iterations=iterations, exchange=Exchange(rounds=rounds))
 
 
 def measure(name: str, options: argparse.Namespace) -> Curve:
