@@ -52,15 +52,18 @@ class InterruptFlag(_Handlers):
 
     Args:
         active: Whether to do so at all.
+        patient: Whether the second has no effect either, as where a launcher of several processes hands on to each
+            what has reached all of them already.
 
     Attributes:
         raised: Whether a signal has come.
     """
 
-    def __init__(self, active: bool = True) -> None:
+    def __init__(self, active: bool = True, patient: bool = False) -> None:
         super().__init__()
         self.raised = False
         self._active = active
+        self._patient = patient
 
     def _takes(self, number: signal.Signals) -> bool:
         # nohup has hang-ups ignored so that the run goes on.
@@ -68,7 +71,8 @@ class InterruptFlag(_Handlers):
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         self.raised = True
-        self._restore()
+        if not self._patient:
+            self._restore()
 
 
 class OrderlyExit(_Handlers):
@@ -77,18 +81,24 @@ class OrderlyExit(_Handlers):
     Amid an import the process leaves at once instead, with exit code 130: there Python and compiled modules lose that
     exception, or make others of it, and nothing is half done. Signals that are handled or ignored already stay so.
 
+    Args:
+        patient: Whether signals after the first have no effect, see `InterruptFlag`.
+
     Attributes:
         raised: Whether a signal has come.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, patient: bool = False) -> None:
         super().__init__()
         self.raised = False
+        self._patient = patient
 
     def _takes(self, number: signal.Signals) -> bool:
         return signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
+        if self.raised and self._patient:
+            return
         self.raised = True
         if _is_import(frame):
             _leave()

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import difflib
 import importlib
+import os
 import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -24,6 +25,7 @@ __all__ = ["COMMANDS", "command_type", "console", "main", "parse_command"]
 
 _USAGE_ERROR = 2
 _HELP = ("-h", "--help")
+_LAUNCHED = "TORCHELASTIC_RUN_ID"  # a variable of processes that torchrun has started
 
 COMMANDS = {
     "fit": "fit.Fit",
@@ -78,7 +80,7 @@ def main(args: Sequence[str] | None = None) -> int:
     Returns:
         The exit code: 0, 2 for bad input (one sentence on standard error), 130 when interrupted.
     """
-    with OrderlyExit() as signals:
+    with OrderlyExit(patient=_LAUNCHED in os.environ) as signals:
         try:
             return _main(list(sys.argv[1:] if args is None else args))
         except KeyboardInterrupt:

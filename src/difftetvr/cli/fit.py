@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import shlex
-from collections.abc import Sequence
+import signal
+import warnings
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, get_args
@@ -18,15 +21,18 @@ from difftetvr.cli.saved import SavedRun, saved_run
 from difftetvr.errors import FitError, counted
 from difftetvr.fitting.config import CHOSEN_FOR_CAPTURE, FitConfig, Refine
 from difftetvr.fitting.records.folder import RunFolder
-from difftetvr.terminal import waiting
+from difftetvr.terminal import sentence_for, waiting
 
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from difftetvr.capture.capture import Capture
+    from difftetvr.fitting.processes import Processes
     from difftetvr.fitting.records.result import FitResult
     from difftetvr.fitting.trainer import Trainer
 
 _NOTICEABLY = 1.1
+_BAD_INPUT = 2  # exit code
 
 
 @dataclass(frozen=True)
@@ -67,8 +73,17 @@ class Fit:
     }
 
     def run(self, console: Console) -> None:
-        """Fits, and fills the output folder."""
-        from difftetvr.fitting.loop import prepare
+        """Fits, and fills the output folder; of several processes the first does so, and alone says anything."""
+        from difftetvr.fitting.processes import Processes
+
+        # First of all: it chooses the GPU.
+        with Processes.joined() as processes, _said_once(processes):
+            if processes.is_first:
+                self._fit(console, processes)
+            else:
+                self._take_part(console, processes)
+
+    def _fit(self, console: Console, processes: Processes) -> None:
         from difftetvr.view.report import write_report
 
         folder = RunFolder(self.output)
@@ -78,8 +93,9 @@ class Fit:
             views_of = self.views_of.sized_for(self.capture, self.config.device, console)
             capture = views_of.load(self.capture, console)
             with waiting(console, "Reading the checkpoint" if self.resume else "Making the mesh to begin with"):
-                trainer = prepare(capture, self.config, resume_from=folder.checkpoint if self.resume else None)
+                trainer = self._prepare(capture, folder, processes)
             chosen = dataclasses.replace(self, config=trainer.config, views_of=views_of)
+            _print_processes(console, trainer)
             if capture.encoding == "srgb":
                 _print_choices(console, self.config, trainer.config)
             if self.config.initial_mesh is not None:
@@ -93,6 +109,23 @@ class Fit:
             with waiting(console, f"Drawing pictures into {self.output}"):
                 write_report(folder, result, capture)
         _print_summary(console, result.metrics, folder)
+
+    def _take_part(self, console: Console, processes: Processes) -> None:
+        """What all processes but the first do: their share of the work, in silence."""
+        from difftetvr.fitting.loop import optimise
+
+        console.quiet = True
+        warnings.simplefilter("ignore")
+        folder = RunFolder(self.output)
+        self._require_same_run(folder)
+        capture = self.views_of.sized_for(self.capture, self.config.device, console).load(self.capture, console)
+        optimise(self._prepare(capture, folder, processes), folder.checkpoint)
+
+    def _prepare(self, capture: Capture, folder: RunFolder, processes: Processes) -> Trainer:
+        from difftetvr.fitting.loop import prepare
+
+        resume_from = folder.checkpoint if self.resume else None
+        return prepare(capture, self.config, resume_from=resume_from, processes=processes)
 
     def _optimise(self, trainer: Trainer, folder: RunFolder, console: Console) -> FitResult:
         from difftetvr.fitting.loop import optimise
@@ -135,6 +168,43 @@ class Fit:
         if saved.capture_options != self.views_of:
             raise FitError(f"The run in {self.output} has other views; resume with the same options for them.")
         saved.fit.require_same_run(self.config)
+
+
+@contextlib.contextmanager
+def _said_once(processes: Processes) -> Iterator[None]:
+    """Context in which an error is raised by the first process alone that meets with one; others leave in silence."""
+    try:
+        yield
+    except BaseException as end:
+        if processes.count == 1:
+            raise
+        # Once a process has left, who has started them asks the others to: they do, but first say why.
+        with contextlib.suppress(ValueError):  # of threads, to which no signals come
+            signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        said_first = processes.speaks_first()
+        cause = _mendable(end)
+        if cause is None:
+            raise
+        if said_first:
+            raise cause from None
+        raise SystemExit(_BAD_INPUT) from end
+
+
+def _mendable(end: BaseException | None) -> Exception | None:
+    """The error that has a sentence for the user, of one and those that it came amidst."""
+    while end is not None:
+        if isinstance(end, Exception) and sentence_for(end) is not None:
+            return end
+        end = end.__context__
+    return None
+
+
+def _print_processes(console: Console, trainer: Trainer) -> None:
+    """Says how the work is shared, where it is."""
+    count, batch = trainer.processes.count, trainer.config.batch
+    if count > 1:
+        idle = f", so that {counted(count - batch, 'process', 'processes')} will wait" if batch < count else ""
+        console.print(f"{count} processes, {counted(batch, 'view')} an iteration{idle}", highlight=False)
 
 
 def _print_choices(console: Console, given: FitConfig, chosen: FitConfig) -> None:

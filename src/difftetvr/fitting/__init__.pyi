@@ -7,6 +7,7 @@ from . import motion as motion
 from . import options as options
 from . import parameters as parameters
 from . import positions as positions
+from . import processes as processes
 from . import records as records
 from . import refinement as refinement
 from . import regularizers as regularizers
@@ -17,6 +18,7 @@ from .motion import Motion as Motion
 from .motion import VertexOptimizerConfig as VertexOptimizerConfig
 from .positions import StepReport as StepReport
 from .positions import VertexOptimizer as VertexOptimizer
+from .processes import Processes as Processes
 from .records.evaluation import Evaluation as Evaluation
 from .records.evaluation import evaluate as evaluate
 from .records.progress import ProgressDisplay as ProgressDisplay
@@ -40,6 +42,7 @@ __all__ = [
     "Grow",
     "Moment",
     "Motion",
+    "Processes",
     "Progress",
     "ProgressDisplay",
     "Refinement",

@@ -98,8 +98,8 @@ class FitConfig:
     """Whether colour and density belong to vertices, linear in between, or to cells, constant inside."""
     iterations: int | None = None
     """Number of optimisation steps; default: 4800 for photographs, else 2400."""
-    batch_views: int = 1
-    """Training views per step; their gradients are averaged."""
+    batch_views: int | None = None
+    """Training views per step; their gradients are averaged. Default: one for each process."""
     loss: LossName = "l2"
     """Mean squared (l2) or mean absolute (l1) difference of the images; l1-ssim has a fifth of 1 - SSIM in it."""
     harmonics: int | None = None
@@ -192,6 +192,11 @@ class FitConfig:
         return self.iterations or _DEFAULT_ITERATIONS
 
     @property
+    def batch(self) -> int:
+        """Training views per step, where the options do not leave it open."""
+        return self.batch_views or 1
+
+    @property
     def needs_alpha(self) -> bool:
         """Whether training images must be composited over something that is not black."""
         return self.background not in (None, "black", (0.0, 0.0, 0.0))
@@ -205,6 +210,10 @@ class FitConfig:
         choices = self._choices_for_photos(capture) if capture.encoding == "srgb" else _CHOICES_FOR_VOLUMES
         left_open = {name: choices[name] for name in CHOSEN_FOR_CAPTURE if getattr(self, name) is None}
         return dataclasses.replace(self, **left_open)
+
+    def for_processes(self, count: int) -> FitConfig:
+        """These options with so many views per step, if that was left open."""
+        return self if self.batch_views is not None else dataclasses.replace(self, batch_views=count)
 
     def _choices_for_photos(self, capture: Capture) -> dict[str, Any]:
         pixels = sum(math.prod(capture.image_sizes[view]) for view in capture.train_indices.tolist())
@@ -262,8 +271,8 @@ class FitConfig:
         The views are shuffled anew in each pass over them. The order is a function of seed and iteration alone, so a
         resumed run sees the views that an uninterrupted one would have seen.
         """
-        first = iteration * self.batch_views
-        return [self._view(k, view_count) for k in range(first, first + self.batch_views)]
+        first = iteration * self.batch
+        return [self._view(k, view_count) for k in range(first, first + self.batch)]
 
     def background_at(self, iteration: int) -> tuple[float, float, float]:
         """Linear RGB background of a step; like the views a function of seed and iteration alone."""

@@ -15,8 +15,8 @@ import torch
 from difftetvr.capture.capture import Capture
 from difftetvr.errors import FitError, shown
 from difftetvr.fitting.config import FitConfig
+from difftetvr.fitting.processes import ALONE, Processes
 from difftetvr.fitting.records.checkpoint import Checkpoint, alone_with, require_no_folder
-from difftetvr.fitting.records.evaluation import evaluate
 from difftetvr.fitting.records.result import FitResult, Progress
 from difftetvr.fitting.refinement import Strategy
 from difftetvr.fitting.trainer import Trainer
@@ -34,6 +34,7 @@ def fit(
     checkpoint: str | Path | None = None,
     resume: bool = False,
     on_progress: Callable[[Progress], None] | None = None,
+    processes: Processes | None = None,
 ) -> FitResult:
     """Optimises colours, densities and vertices of a tetrahedral mesh so that its renderings match images.
 
@@ -48,6 +49,8 @@ def fit(
             last one, and when interrupted by SIGINT, SIGTERM or SIGHUP.
         resume: Go on from ``checkpoint`` if it exists; ``mesh`` is then the checkpoint's.
         on_progress: Called after every iteration.
+        processes: Those that fit together, see `difftetvr.fitting.Processes`; each makes this call with the same
+            arguments and gets the same result, the first saves the checkpoint. Default: this one alone.
 
     Returns:
         The mesh, its field and the metrics on the held-out views.
@@ -55,16 +58,24 @@ def fit(
     Raises:
         CaptureError: The images do not allow what the options ask for.
         FitError: The checkpoint cannot be read, written, or is of another run or of one that is going on, the initial
-            mesh does not suit the options or the images, or the loss is not finite.
+            mesh does not suit the options or the images, the loss is not finite, or another process has ended or has
+            come to another mesh.
         MeshError: The file of the initial mesh cannot be read or holds an invalid mesh, or the grid is too large.
         KeyboardInterrupt: The run was interrupted; the checkpoint is saved.
     """
     _require_kinds(capture, config, mesh, strategy, on_progress)
+    require_type(processes, (Processes, NoneType), "processes", "pass what Processes.joined() gives", FitError)
     require_type(checkpoint, (str, os.PathLike, NoneType), "checkpoint", "pass the name of a file", FitError)
     path = Path(checkpoint) if checkpoint is not None else None
-    with contextlib.nullcontext() if path is None else alone_with(path):
+    processes = processes or ALONE
+    with alone_with(path) if path is not None and processes.is_first else contextlib.nullcontext():
         trainer = prepare(
-            capture, config or FitConfig(), mesh=mesh, strategy=strategy, resume_from=path if resume else None
+            capture,
+            config or FitConfig(),
+            mesh=mesh,
+            strategy=strategy,
+            resume_from=path if resume else None,
+            processes=processes,
         )
         return optimise(trainer, path, on_progress)
 
@@ -76,6 +87,7 @@ def prepare(
     mesh: TetMesh | None = None,
     strategy: Strategy | None = None,
     resume_from: Path | None = None,
+    processes: Processes = ALONE,
 ) -> Trainer:
     """The first half of :func:`fit`: everything that can fail before the first iteration, without writing anything.
 
@@ -85,17 +97,29 @@ def prepare(
         mesh: Mesh to begin with; default: that of ``config``, a file or one made for the capture.
         strategy: How the mesh is refined; default: as ``config.refine`` says.
         resume_from: Checkpoint to go on from if it exists.
+        processes: Those that fit together.
 
     Raises:
         CaptureError: The images do not allow what the options ask for.
         FitError: The checkpoint cannot be read or is of another run, the device does not exist, or the initial mesh
-            does not suit the options or the images.
+            does not suit the options or the images, or the processes do not begin with the same.
         MeshError: The file of the initial mesh cannot be read or holds an invalid mesh, or the grid is too large.
         BackendError: The device has no back end.
     """
-    if resume_from is not None and resume_from.exists():
-        return Trainer.resume(capture, config, Checkpoint.load(resume_from), strategy)
-    return Trainer(capture, config, mesh, strategy)
+    with processes.in_order():
+        if resume_from is not None and resume_from.exists():
+            trainer = Trainer.resume(capture, config, Checkpoint.load(resume_from), strategy, processes)
+        else:
+            trainer = Trainer(capture, config, mesh, strategy, processes)
+    kind = trainer.mesh.vertices.device.type
+    processes.require_same(
+        kind,
+        f"Not all of the {processes.count} processes have a device of the kind {kind}; start as many on each machine "
+        "as it has GPUs, or give --device cpu.",
+    )
+    # Nothing is written before all have read what there was.
+    trainer.require_agreement()
+    return trainer
 
 
 def optimise(
@@ -112,13 +136,11 @@ def optimise(
         FitError: The checkpoint cannot be written, or the loss is not finite.
         KeyboardInterrupt: The run was interrupted; the checkpoint is saved.
     """
-    capture, config = trainer.capture, trainer.config
-    held_out = capture.test_indices.tolist()
     with _one_torch_thread():
         _run(trainer, path, on_progress)
-        field = trainer.parameters.detached_field()
-        evaluation = evaluate(trainer.mesh, field, capture, held_out, config.evaluation_background())
-    return FitResult(trainer.mesh, field, evaluation, trainer.history, config)
+        evaluation = trainer.evaluate(trainer.capture.test_indices.tolist())
+    field = trainer.parameters.detached_field()
+    return FitResult(trainer.mesh, field, evaluation, trainer.history, trainer.config)
 
 
 def _require_kinds(capture: object, config: object, mesh: object, strategy: object, on_progress: object) -> None:
@@ -134,15 +156,18 @@ def _require_kinds(capture: object, config: object, mesh: object, strategy: obje
 
 def _run(trainer: Trainer, path: Path | None, on_progress: Callable[[Progress], None] | None) -> None:
     """Iterates to the end, with glances and checkpoints on the way."""
-    config, history = trainer.config, trainer.history
-    if path is not None and trainer.iteration < config.steps:
+    config, history, processes = trainer.config, trainer.history, trainer.processes
+    file = path if processes.is_first else None
+    if file is not None and trainer.iteration < config.steps:
         # A full disk or a forbidden folder is found before the work, not with its result.
-        require_no_folder(path)
-        trainer.checkpoint().save(path)
+        require_no_folder(file)
+        trainer.checkpoint().save(file)
     start = time.perf_counter() - history.seconds
     saved = time.perf_counter()
-    with InterruptFlag(active=path is not None) as interrupt:
-        while trainer.iteration < config.steps and not interrupt.raised:
+    with InterruptFlag(active=path is not None, patient=processes.count > 1) as interrupt:
+        # A signal may reach one process in this iteration and another in the next.
+        stopped = processes.any(interrupt.raised)
+        while trainer.iteration < config.steps and not stopped:
             trainer.step()
             last = trainer.iteration == config.steps
             if config.evaluate_every and (trainer.iteration % config.evaluate_every == 0 or last):
@@ -151,11 +176,15 @@ def _run(trainer: Trainer, path: Path | None, on_progress: Callable[[Progress], 
             if on_progress is not None:
                 on_progress(trainer.progress(history.seconds))
             due = time.perf_counter() - saved >= config.checkpoint_seconds
-            if path is not None and (due or last):
-                trainer.checkpoint().save(path)
+            if file is not None and (due or last):
+                trainer.checkpoint().save(file)
                 saved = time.perf_counter()
-        if interrupt.raised and path is not None:
-            trainer.checkpoint().save(path)
+            stopped = processes.any(interrupt.raised)
+        if stopped:
+            if file is not None:
+                trainer.checkpoint().save(file)
+            # Once one process has left, who has started them may kill the others.
+            processes.any(stopped)
             raise KeyboardInterrupt
 
 

@@ -82,6 +82,14 @@ class FieldParameters:
         harmonics = self.harmonics[:, : COUNTS[bands]] if self.harmonics is not None and bands else None
         return Field(self.color, self.density_unit * self.density, self.location, harmonics)
 
+    def leaves(self, bands: int) -> list[torch.Tensor]:
+        """What the gradients of :meth:`field` gather in.
+
+        Args:
+            bands: Bands of the harmonics that take part.
+        """
+        return [self.color, self.density, *([self.harmonics] if self.harmonics is not None and bands else [])]
+
     def detached_field(self) -> Field:
         """A copy of the field as it is now, without gradients."""
         color, density = self.color.detach().clone(), self.density_unit * self.density.detach()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import astuple
+from dataclasses import astuple, replace
 
 import torch
 
@@ -17,8 +17,9 @@ from difftetvr.fitting.losses import LOSSES, sparsity
 from difftetvr.fitting.metrics import psnr_of_mse
 from difftetvr.fitting.parameters import FieldParameters
 from difftetvr.fitting.positions import StepReport, VertexOptimizer
+from difftetvr.fitting.processes import ALONE, Processes
 from difftetvr.fitting.records.checkpoint import Checkpoint, describe_capture, require_same_capture
-from difftetvr.fitting.records.evaluation import counted_share, evaluate, true_image, where_valid
+from difftetvr.fitting.records.evaluation import Evaluation, counted_share, evaluate, true_image, where_valid
 from difftetvr.fitting.records.history import History, MoveTotals, RefinementRecord
 from difftetvr.fitting.records.result import Progress
 from difftetvr.fitting.refinement import Moment, Refinement, Situation, Strategy
@@ -45,10 +46,16 @@ class Trainer:
         history: What happened so far.
         repair: What mending the initial mesh changed, in words; None where it was not mended.
         starts_from_field: Whether the initial mesh brought colours and densities along.
+        processes: Those that fit together; all of them hold the same state.
     """
 
     def __init__(
-        self, capture: Capture, config: FitConfig, mesh: TetMesh | None = None, strategy: Strategy | None = None
+        self,
+        capture: Capture,
+        config: FitConfig,
+        mesh: TetMesh | None = None,
+        strategy: Strategy | None = None,
+        processes: Processes = ALONE,
     ) -> None:
         """Prepares the first iteration.
 
@@ -57,6 +64,7 @@ class Trainer:
             config: Options.
             mesh: Mesh to begin with; default: the file or the starting mesh that the options ask for.
             strategy: How to refine it; default: as the options say.
+            processes: Those that fit together; default: this one alone.
 
         Raises:
             CaptureError: The background needs alpha that the capture lacks.
@@ -64,12 +72,13 @@ class Trainer:
                 the initial mesh does not suit the options or the images.
             MeshError: The file of the initial mesh cannot be read or holds an invalid mesh, or the grid is too large.
         """
-        config = config.for_capture(capture)
+        config = config.for_capture(capture).for_processes(processes.count)
         strategy = strategy or config.strategy()
         require_fittable(capture, config, strategy)
         self.capture = capture
         self.config = config
         self.strategy = strategy
+        self.processes = processes
         start = _start(capture, config, strategy, mesh)
         self.repair = start.repair
         self.starts_from_field = start.field is not None
@@ -100,14 +109,7 @@ class Trainer:
         self._refine_if_due()
         rate = self._motion_rate()
         mesh = self.positions.mesh if self.positions and rate is not None else self.mesh
-        self.parameters.zero_grad()
-        batch = self.config.views_at(self.iteration, len(self._train_views))
-        background = self.config.background_at(self.iteration)
-        losses, errors = [], []
-        for position in batch:
-            loss, error = self._accumulate(mesh, self._train_views[position], background, 1.0 / len(batch))
-            losses.append(loss)
-            errors.append(error)
+        losses, errors = self._gather_gradients(mesh)
         if not all(math.isfinite(loss) for loss in losses):
             raise FitError(
                 f"The loss of iteration {self.iteration} is not finite; check the images or lower the learning rate."
@@ -122,11 +124,32 @@ class Trainer:
         """Notes the mean PSNR over a few held-out views, for the curves; decides nothing."""
         tested = self.capture.test_indices.tolist()
         views = tested[:: max(1, math.ceil(len(tested) / _GLANCE_VIEWS))]
-        seen = evaluate(
-            self.mesh, self.parameters.detached_field(), self.capture, views, self.config.evaluation_background()
-        ).mean_psnr
+        seen = self.evaluate(views).mean_psnr
         if seen is not None:
             self.history.evaluations.append((self.iteration, seen))
+
+    def evaluate(self, views: list[int]) -> Evaluation:
+        """Image quality of the reconstruction as it is now; each view is rendered by one of the processes.
+
+        Args:
+            views: Indices of the views to compare.
+        """
+        mesh, field, background = self.mesh, self.parameters.detached_field(), self.config.evaluation_background()
+        own = [evaluate(mesh, field, self.capture, [view], background).row for view in self.processes.share(views)]
+        return Evaluation.of_rows(self.processes.gathered(own, len(views), 3))
+
+    def require_agreement(self) -> None:
+        """Checks that all processes have come to the same state.
+
+        Raises:
+            FitError: They have not.
+        """
+        if self.processes.count > 1:
+            self.processes.require_same(
+                self.checkpoint().digest(),
+                f"The processes have come to different meshes after {self.iteration} iterations; start all of them "
+                "with the same command, files and versions, on machines of one kind.",
+            )
 
     def checkpoint(self) -> Checkpoint:
         """The state, to be saved."""
@@ -148,7 +171,11 @@ class Trainer:
 
     @staticmethod
     def resume(
-        capture: Capture, config: FitConfig, checkpoint: Checkpoint, strategy: Strategy | None = None
+        capture: Capture,
+        config: FitConfig,
+        checkpoint: Checkpoint,
+        strategy: Strategy | None = None,
+        processes: Processes = ALONE,
     ) -> Trainer:
         """Goes on from a checkpoint.
 
@@ -158,10 +185,12 @@ class Trainer:
             FitError: The checkpoint is of a run with other options or images, lacks something, or has come further than
                 the options ask for.
         """
+        # However many processes go on: the run stays what it is.
+        config = replace(config, batch_views=config.batch_views or checkpoint.config.batch)
         asked = config.for_capture(capture)
         checkpoint.config.require_same_run(asked)
         checkpoint.require_not_beyond(asked.steps)
-        trainer = Trainer(capture, config, checkpoint.mesh(), strategy)
+        trainer = Trainer(capture, config, checkpoint.mesh(), strategy, processes)
         require_same_capture(checkpoint.capture, trainer._capture_description)
         checkpoint.require_strategy(type(trainer.strategy).__name__)
         checkpoint.require_tensors_like(trainer.checkpoint().tensors)
@@ -194,7 +223,7 @@ class Trainer:
     @property
     def _epoch(self) -> int:
         """Iterations of one pass over the training views."""
-        return max(1, len(self._train_views) // self.config.batch_views)
+        return max(1, len(self._train_views) // self.config.batch)
 
     def _budget(self, mesh_is_given: bool) -> int:
         """The options' cells; a given mesh is its own budget, unless the strategy is to make it grow."""
@@ -228,7 +257,12 @@ class Trainer:
     def _refine_if_due(self) -> None:
         if self.strategy is None or not self.strategy.is_due(self._moment()):
             return
-        judgement, mesh = self._judgement(self.strategy.views), self.mesh
+        with self.processes.in_order():
+            self._refine(self.strategy)
+        self.require_agreement()
+
+    def _refine(self, strategy: Strategy) -> None:
+        judgement, mesh = self._judgement(strategy.views), self.mesh
         unit = self.capture.density_unit
 
         def model(face_steps: torch.Tensor | None) -> ImageModel:
@@ -237,7 +271,7 @@ class Trainer:
             return judgement.model(mesh, field, deterministic, steps).with_density_unit(unit)
 
         values = self.parameters.values(unit)
-        refinement = self.strategy.refine(
+        refinement = strategy.refine(
             Situation(mesh, values, self._moment(), model, self._color_gradients, self._free_space)
         )
         if refinement is None:
@@ -269,6 +303,8 @@ class Trainer:
             self.mesh,
             self.config.background_at(self.iteration),
             self.config.refinement_random(self.iteration),
+            self.config.batch,
+            self.processes,
         )
         # Colours by direction are known for rays that start at one point.
         return judgement if self.parameters.harmonics is not None else judgement.together()
@@ -288,13 +324,40 @@ class Trainer:
         """(V,) sums over all training views of the absolute derivatives of the loss by the vertices' colours."""
         background = self.config.background_at(self.iteration)
         total = torch.zeros_like(self.parameters.density, requires_grad=False)
-        for view in self._train_views:
+        for share in self.processes.shares(self._train_views, self.config.batch):
+            total += self._color_gradients_of(share, background)
+        return self.processes.sum(total)
+
+    def _color_gradients_of(self, views: list[int], background: tuple[float, float, float]) -> torch.Tensor:
+        total = torch.zeros_like(self.parameters.density, requires_grad=False)
+        for view in views:
             self.parameters.zero_grad()
             self._accumulate(self.mesh, view, background, 1.0)
             gradient = self.parameters.color.grad
             if gradient is not None:
                 total += gradient.abs().sum(1)
         return total
+
+    def _gather_gradients(self, mesh: TetMesh) -> tuple[list[float], list[float]]:
+        """Adds the mean gradient over the views of this iteration; returns their losses and mean squared errors."""
+        leaves = self.parameters.leaves(self.config.bands_at(self.iteration))
+        leaves += [mesh.vertices] if mesh.vertices.requires_grad else []
+        before = mesh.vertices.grad  # of earlier iterations, in which all processes have a part already
+        for leaf in leaves:
+            leaf.grad = None
+        batch = self.config.views_at(self.iteration, len(self._train_views))
+        background = self.config.background_at(self.iteration)
+        own = [
+            self._accumulate(mesh, self._train_views[position], background, 1.0 / len(batch))
+            for position in self.processes.share(batch)
+        ]
+        rows = self.processes.gathered(own, len(batch), 2)
+        gradients = [torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for leaf in leaves]
+        for leaf, gradient in zip(leaves, self.processes.sum(gradients), strict=True):
+            leaf.grad = gradient
+        if before is not None and mesh.vertices.grad is not None:
+            mesh.vertices.grad = before + mesh.vertices.grad
+        return [loss for loss, _ in rows], [error for _, error in rows]
 
     def _accumulate(
         self, mesh: TetMesh, view: int, background: tuple[float, float, float], weight: float

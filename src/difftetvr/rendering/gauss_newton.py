@@ -42,6 +42,16 @@ class HatDerivatives:
     absorption: torch.Tensor
     weight: torch.Tensor
 
+    @staticmethod
+    def zeros(like: torch.Tensor, count: int) -> HatDerivatives:
+        """Models of no error.
+
+        Args:
+            like: Of the device and type wanted.
+            count: Number N of the hats.
+        """
+        return HatDerivatives(*(like.new_zeros(count, *shape) for shape in ((4,), (), (3,), (), ())))
+
     def __add__(self, other: HatDerivatives) -> HatDerivatives:
         """Models of the sum of two errors."""
         return HatDerivatives(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
@@ -149,6 +159,24 @@ class ImageModel:
     faces: HatDerivatives | None
     error: float
     face_steps: StepDerivatives | None = None
+
+    @staticmethod
+    def zero(mesh: TetMesh, has_steps: bool) -> ImageModel:
+        """The model of no image at all, which is 0.
+
+        Args:
+            mesh: The mesh.
+            has_steps: Whether one step of each face is asked for.
+        """
+        like, topology = mesh.vertices.detach(), mesh.topology
+        edges, faces = topology.edges.shape[0], topology.faces.shape[0]
+        return ImageModel(
+            HatDerivatives.zeros(like, mesh.num_vertices),
+            HatDerivatives.zeros(like, edges),
+            None if has_steps else HatDerivatives.zeros(like, faces),
+            0.0,
+            StepDerivatives(like.new_zeros(faces), like.new_zeros(faces)) if has_steps else None,
+        )
 
     def __add__(self, other: ImageModel) -> ImageModel:
         """The model of two views' summed errors."""

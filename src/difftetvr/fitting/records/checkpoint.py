@@ -116,6 +116,13 @@ class Checkpoint:
         except (FitError, KeyError, ValueError, TypeError, AttributeError, OverflowError) as error:
             raise _unreadable(path, _reason(error)) from error
 
+    def digest(self) -> str:
+        """SHA-256 of what the next iterations depend on: options, mesh, parameters, moments, which images."""
+        tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in self.tensors.items()}
+        # Machines may read the same images to other last digits.
+        images = {name: value for name, value in self.capture.items() if not isinstance(value, float)}
+        return _checksum(json.dumps([self.iteration, self.config.to_json(), images, self.budget]), tensors)
+
     def mesh(self) -> TetMesh:
         """The mesh of the run.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -35,6 +36,19 @@ class Evaluation:
     views: list[int]
     psnr: list[float]
     ssim: list[float]
+
+    @staticmethod
+    def of_rows(rows: list[list[float]]) -> Evaluation:
+        """What evaluations of one view each, as their :attr:`row`, say together."""
+        seen = [row for row in rows if not math.isnan(row[0])]
+        ssims = [row[2] for row in seen if not math.isnan(row[2])]
+        return Evaluation([int(row[0]) for row in seen], [row[1] for row in seen], ssims)
+
+    @property
+    def row(self) -> list[float]:
+        """View, PSNR and SSIM of the only view, NaN for what is not known: numbers that processes can exchange."""
+        view: list[float] = [float(self.views[0]), *self.psnr] if self.views else [math.nan, math.nan]
+        return view + (self.ssim or [math.nan])
 
     @property
     def mean_psnr(self) -> float | None:

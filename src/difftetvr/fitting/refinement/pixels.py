@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from difftetvr.capture.capture import Capture
+from difftetvr.fitting.processes import ALONE, Processes
 from difftetvr.fitting.records.evaluation import Color, counted_share, true_image
 from difftetvr.mesh.field import Field
 from difftetvr.mesh.tetmesh import TetMesh
@@ -32,12 +33,14 @@ class JudgedPixels:
         truth: (1, N, 3) what they should be.
         valid: (1, N) bool, those that count; None: all.
         background: Linear RGB behind the volume.
+        views: Views that they are of.
     """
 
     rays: Rays
     truth: torch.Tensor
     valid: torch.Tensor | None
     background: Color
+    views: int = 1
 
     @staticmethod
     def of(capture: Capture, view: int, background: Color) -> JudgedPixels:
@@ -63,7 +66,7 @@ class JudgedPixels:
     def _at(self, places: torch.Tensor) -> JudgedPixels:
         rays = Rays(self.rays.origins[:, places], self.rays.directions[:, places])
         valid = None if self.valid is None else self.valid[:, places]
-        return JudgedPixels(rays, self.truth[:, places], valid, self.background)
+        return replace(self, rays=rays, truth=self.truth[:, places], valid=valid)
 
     def model(
         self, mesh: TetMesh, field: Field, deterministic: bool, face_steps: torch.Tensor | None = None
@@ -93,13 +96,27 @@ class JudgedPixels:
 
 @dataclass(frozen=True)
 class Judgement:
-    """What refinements are judged on: pixels of some views, in one bundle or one for each view."""
+    """What refinements are judged on: pixels of some views, in one bundle or one for each view.
 
-    parts: list[JudgedPixels]
+    Attributes:
+        shares: Bundles that this process renders, in the shares that work is dealt out in.
+        views: Number of the views of all processes.
+        processes: These.
+    """
+
+    shares: list[list[JudgedPixels]]
+    views: int
+    processes: Processes = ALONE
 
     @staticmethod
     def of(
-        capture: Capture, views: Sequence[int], mesh: TetMesh, background: Color, generator: np.random.Generator
+        capture: Capture,
+        views: Sequence[int],
+        mesh: TetMesh,
+        background: Color,
+        generator: np.random.Generator,
+        shares: int = 1,
+        processes: Processes = ALONE,
     ) -> Judgement:
         """Choose pixels: evenly spread, and as many as predictions about the cells of a mesh need.
 
@@ -109,33 +126,53 @@ class Judgement:
             mesh: The mesh that is to be refined.
             background: Linear RGB behind the volume.
             generator: Makes the choice.
+            shares: To how many shares the views are dealt out; each is summed up by itself.
+            processes: Those that take the shares.
         """
         wanted = max(1, round(_CROSSINGS * mesh.num_cells ** (2 / 3) / len(views)))
-        every = (JudgedPixels.of(capture, view, background) for view in views)
-        return Judgement([pixels.spread(wanted, generator.random()) for pixels in every])
+        chosen = [(view, generator.random()) for view in views]
+        own = [
+            [JudgedPixels.of(capture, view, background).spread(wanted, begin) for view, begin in share]
+            for share in processes.shares(chosen, shares)
+        ]
+        return Judgement(own, len(views), processes)
+
+    @property
+    def parts(self) -> list[JudgedPixels]:
+        """All bundles that this process renders."""
+        return [part for share in self.shares for part in share]
 
     def together(self) -> Judgement:
-        """The same with all views in one bundle of rays."""
-        return Judgement([_joined(self.parts)])
+        """The same with all views of a share in one bundle of rays."""
+        return replace(self, shares=[[_joined(share)] for share in self.shares])
 
     def some(self) -> Judgement:
         """An eighth of the pixels: enough to see what became of the error."""
-        return Judgement([part.spread(max(1, part.count // 8), 0.5) for part in self.parts])
+        return replace(self, shares=[[part.spread(max(1, part.count // 8), 0.5) for part in s] for s in self.shares])
 
     def model(
         self, mesh: TetMesh, field: Field, deterministic: bool, face_steps: torch.Tensor | None = None
     ) -> ImageModel:
         """Quadratic models of the squared error, means over the views; see `model_image` for the steps."""
-        models = (part.model(mesh, field, deterministic, face_steps) for part in self.parts)
-        return reduce(add, models).scaled(1.0 / len(self.parts))
+        sums = []
+        for share in self.shares:
+            models = (part.model(mesh, field, deterministic, face_steps).scaled(self._weight(part)) for part in share)
+            sums.append(reduce(add, models))
+        # A process may have nothing to do, and still takes part in the sum.
+        return self.processes.sum(reduce(add, sums) if sums else ImageModel.zero(mesh, face_steps is not None))
 
     def error(self, mesh: TetMesh, field: Field) -> float:
         """Mean squared error."""
-        return sum(part.error(mesh, field) for part in self.parts) / len(self.parts)
+        shares = (sum(self._weight(part) * part.error(mesh, field) for part in share) for share in self.shares)
+        return self.processes.sum(float(sum(shares)))
+
+    def _weight(self, part: JudgedPixels) -> float:
+        """Of a bundle in the mean over all views."""
+        return part.views / self.views
 
 
 def _joined(parts: list[JudgedPixels]) -> JudgedPixels:
     rays, masks = [part.rays for part in parts], [part.valid for part in parts if part.valid is not None]
     origins, directions = (torch.cat([getattr(r, name) for r in rays], 1) for name in ("origins", "directions"))
-    truth = torch.cat([part.truth for part in parts], 1)
-    return JudgedPixels(Rays(origins, directions), truth, torch.cat(masks, 1) if masks else None, parts[0].background)
+    truth, valid = torch.cat([part.truth for part in parts], 1), torch.cat(masks, 1) if masks else None
+    return JudgedPixels(Rays(origins, directions), truth, valid, parts[0].background, sum(part.views for part in parts))
