@@ -1,7 +1,9 @@
 """What all tests share: the `gpu` marker, threads, and the folder of example data."""
 
 import os
-from collections.abc import Iterator
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -53,6 +55,20 @@ def kernel_threads() -> Iterator[None]:
     dr.set_thread_count(max(2, threads))
     yield
     dr.set_thread_count(threads)
+
+
+@pytest.fixture(scope="session")
+def two_processes() -> Callable[..., subprocess.CompletedProcess[str]]:
+    """Starts a script, or ``-m`` a module, in two processes that know of each other; takes its arguments."""
+    if sys.platform == "win32":
+        pytest.skip("there PyTorch's launcher needs what its packages are built without")
+
+    def run(*args: object) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+        environment = {**os.environ, "PYTHONPATH": str(ROOT / "src"), "CUDA_VISIBLE_DEVICES": ""}
+        return subprocess.run([*command, *map(str, args)], env=environment, capture_output=True, text=True, timeout=600)
+
+    return run
 
 
 @pytest.fixture(scope="session")

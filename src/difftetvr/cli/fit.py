@@ -18,7 +18,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from difftetvr.cli.arguments import Groups
 from difftetvr.cli.options import CAPTURE_GROUPS, CaptureOptions, TrustOptions
 from difftetvr.cli.saved import SavedRun, saved_run
-from difftetvr.errors import FitError, counted
+from difftetvr.errors import DiffTetError, FitError, counted
 from difftetvr.fitting.config import CHOSEN_FOR_CAPTURE, FitConfig, Refine
 from difftetvr.fitting.records.folder import RunFolder
 from difftetvr.terminal import sentence_for, waiting
@@ -190,13 +190,16 @@ def _said_once(processes: Processes) -> Iterator[None]:
         raise SystemExit(_BAD_INPUT) from end
 
 
-def _mendable(end: BaseException | None) -> Exception | None:
-    """The error that has a sentence for the user, of one and those that it came amidst."""
-    while end is not None:
-        if isinstance(end, Exception) and sentence_for(end) is not None:
-            return end
-        end = end.__context__
-    return None
+def _mendable(end: BaseException) -> Exception | None:
+    """The error with a sentence for the user: this one, or that on whose way out an interrupt came."""
+    if isinstance(end, Exception):
+        return end if sentence_for(end) is not None else None
+    before, found = end.__context__, []
+    while before is not None:
+        found += [before] if isinstance(before, Exception) and sentence_for(before) is not None else []
+        before = before.__context__
+    # Ours say most; of others the earliest, for the later ones are of tidying up.
+    return next((error for error in found if isinstance(error, DiffTetError)), found[-1] if found else None)
 
 
 def _print_processes(console: Console, trainer: Trainer) -> None:
