@@ -34,6 +34,19 @@ def test_the_first_signal_raises_the_flag_and_the_second_has_its_usual_effect(as
     assert signal.getsignal(asked) is signal.default_int_handler
 
 
+def test_where_a_launcher_repeats_signals_the_second_has_no_effect(asked):
+    with InterruptFlag(patient=True) as flag:
+        signal.raise_signal(asked)
+        signal.raise_signal(asked)
+        assert flag.raised
+    with OrderlyExit(patient=True) as leave:
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(asked)
+        signal.raise_signal(asked)
+        assert leave.raised
+    assert signal.getsignal(asked) is signal.default_int_handler
+
+
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="only POSIX has terminals that hang up")
 def test_hang_ups_that_nohup_has_ignored_stay_so():
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)

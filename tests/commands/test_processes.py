@@ -73,6 +73,14 @@ def test_what_befalls_all_is_said_once_and_leaves_nothing(two_processes, tmp_pat
     assert not list(tmp_path.iterdir())
 
 
+def test_arguments_that_are_wrong_are_said_by_the_first_process(monkeypatch, capsys):
+    monkeypatch.setenv("TORCHELASTIC_RUN_ID", "none")
+    for rank, said in (("0", 1), ("1", 0)):
+        monkeypatch.setenv("RANK", rank)
+        assert cli.main(["fit", "tooth", "-o", "out", "--cells", "many"]) == 2
+        assert capsys.readouterr().err.count("difftetvr: ") == said
+
+
 @dataclass
 class OneOfTwo:
     """One of two processes, the first or the second that has something to say."""

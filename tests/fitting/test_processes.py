@@ -78,6 +78,10 @@ def test_two_processes_go_on_with_what_one_has_begun(capture, both):
         assert {**result.metrics, "seconds": 0} == found["metrics"]
 
 
+def test_an_interrupt_of_one_process_ends_all_after_the_same_iteration(both):
+    assert [found["interrupted"] for found in both] == [2, 2]
+
+
 def test_a_difference_between_processes_is_found(both):
     for found in both:
         assert found["disagreement"].startswith("The processes have come to different meshes after 0 iterations; ")

@@ -1,6 +1,7 @@
 """What each of several processes does for the tests of fitting together: started by torchrun, given a folder."""
 
 import dataclasses
+import signal
 import sys
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import torch
 from difftetvr.capture import VolumeCapture
 from difftetvr.errors import FitError
 from difftetvr.fitting import Exchange, FitConfig, Processes, Star, fit
+from difftetvr.fitting.records.checkpoint import Checkpoint
 from difftetvr.fitting.trainer import Trainer
 
 CAPTURE = VolumeCapture(views=10, width=24, height=24, steps_per_unit=300.0)
@@ -39,10 +41,6 @@ def advanced(trainer, steps=None):
     return trainer
 
 
-def sentence_of(error):
-    return None if error is None else str(error)
-
-
 def disagreement(capture, processes):
     """What is said when one vertex of one process lies a little elsewhere."""
     trainer = Trainer(capture, CONFIGS["exchange"], processes=processes)
@@ -52,6 +50,26 @@ def disagreement(capture, processes):
         trainer.require_agreement()
     except FitError as error:
         return str(error)
+    return None
+
+
+def idle(capture, processes):
+    """A run of one view an iteration, in which all processes but one have nothing to render."""
+    return state_of(advanced(Trainer(capture, dataclasses.replace(EXCHANGE, batch_views=1), processes=processes), 5))
+
+
+def interrupted(capture, file, processes):
+    """Iterations that are saved when the last process alone is interrupted after the second, twice as launchers do."""
+
+    def interrupt(progress):
+        if progress.iteration == 2 and processes.rank == processes.count - 1:
+            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.SIGTERM)
+
+    try:
+        fit(capture, EXCHANGE, checkpoint=file, on_progress=interrupt, processes=processes)
+    except KeyboardInterrupt:
+        return Checkpoint.load(file).iteration
     return None
 
 
@@ -68,12 +86,8 @@ def main(folder):
         found["metrics"] = {**resumed.metrics, "seconds": 0}
         found["disagreement"] = disagreement(capture, processes)
         found["idle"] = idle(capture, processes)
+        found["interrupted"] = interrupted(capture, folder / "interrupted.safetensors", processes)
         torch.save(found, folder / f"{processes.rank}.pt")
-
-
-def idle(capture, processes):
-    """A run of one view an iteration, in which all processes but one have nothing to render."""
-    return state_of(advanced(Trainer(capture, dataclasses.replace(EXCHANGE, batch_views=1), processes=processes), 5))
 
 
 if __name__ == "__main__":

@@ -124,8 +124,14 @@ def _run(out: Console, given: Sequence[str]) -> None:
     from difftetvr.terminal import waiting
     from difftetvr.trust import trusting
 
-    command = parse_command(given)
-    if out.is_terminal:
+    is_follower = _LAUNCHED in os.environ and os.environ.get("RANK") != "0"
+    try:
+        command = parse_command(given)
+    except DiffTetError as error:
+        if is_follower:  # The first of the processes is told the same, and says so.
+            raise SystemExit(_USAGE_ERROR) from error
+        raise
+    if out.is_terminal and not is_follower:
         with waiting(out, "Loading PyTorch"):
             importlib.import_module("torch")
     trust = getattr(command, "trust", TrustOptions())

@@ -35,7 +35,7 @@ _Summed = TypeVar("_Summed")
 class Processes:
     """The processes that fit together, seen from one of them; by default that one alone.
 
-    All of them make the same calls in the same order. Whatever one of these returns is the same to the last bit in all.
+    All of them make the same calls in the same order. What is summed up or gathered is the same to the last bit in all.
 
     Attributes:
         rank: Number of this one, from 0.

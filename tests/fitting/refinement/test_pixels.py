@@ -63,13 +63,34 @@ def test_models_are_means_over_the_views(
     assert [part.count for part in judged.parts] == [24 * 20] * len(VIEWS)
     images = [model_image(mesh, field, capture.cameras[view], true_image(capture, view)) for view in VIEWS]
     expected = (images[0] + images[1] + images[2]).scaled(1 / 3)
-    for found in (judged.model(mesh, field, True), judged.together().model(mesh, field, True)):
+    dealt = Judgement.of(capture, VIEWS, mesh, BACKGROUND, np.random.default_rng(0), shares=2)
+    assert [len(share) for share in dealt.shares] == [2, 1]
+    for found in (one.model(mesh, field, True) for one in (judged, judged.together(), dealt, dealt.together())):
         for kind in ("vertices", "edges", "faces"):
             one, other = getattr(found, kind), getattr(expected, kind)
             assert float((one.gradient - other.gradient).norm()) <= 1e-3 * float(other.gradient.norm())
             assert float((one.absorption - other.absorption).norm()) <= 1e-3 * float(other.absorption.norm())
         assert found.error == pytest.approx(expected.error, rel=1e-4)
         assert judged.error(mesh, field) == pytest.approx(expected.error, rel=1e-4)
+    assert dealt.together().error(mesh, field) == pytest.approx(expected.error, rel=1e-4)
+
+
+@pytest.mark.parametrize("has_steps", [False, True])
+def test_a_process_without_pixels_has_a_model_that_changes_no_sum(
+    capture: Capture, scene: tuple[TetMesh, Field], has_steps: bool
+) -> None:
+    mesh, field = scene
+    steps = torch.ones(mesh.topology.faces.shape[0], 4) if has_steps else None
+    model = judgement(capture, mesh).together().model(mesh, field, True, steps)
+    nothing = Judgement([], len(VIEWS)).model(mesh, field, True, steps)
+    total, known = model + nothing, model.face_steps if has_steps else model.faces
+    assert total.error == model.error and Judgement([], len(VIEWS)).error(mesh, field) == 0.0
+    for one, other in ((total.vertices, model.vertices), (total.edges, model.edges)):
+        assert torch.equal(one.gradient, other.gradient) and torch.equal(one.coupling, other.coupling)
+    found = total.face_steps if has_steps else total.faces
+    assert type(found) is type(known) and (total.faces is None) == has_steps
+    name = "slope" if has_steps else "gradient"
+    assert torch.equal(getattr(found, name), getattr(known, name))
 
 
 def test_no_more_pixels_than_the_cells_need(
