@@ -87,7 +87,7 @@ class Fit:
         from difftetvr.view.report import write_report
 
         folder = RunFolder(self.output)
-        with folder.claimed():
+        with folder.claimed(), _undisturbed(processes):
             self._require_same_run(folder)
             folder.require_free(resume=self.resume, overwrite=self.overwrite)
             views_of = self.views_of.sized_for(self.capture, self.config.device, console)
@@ -104,7 +104,8 @@ class Fit:
                 _print_excess(console, trainer)
             # Only now: what cannot even start costs no run that is to be replaced.
             options = chosen.to_json() | ({"repair": trainer.repair} if trainer.repair else {})
-            with folder.occupied(options, overwrite=self.overwrite, begun=lambda: trainer.iteration > 0):
+            occupied = folder.occupied(options, overwrite=self.overwrite, begun=lambda: trainer.iteration > 0)
+            with occupied, _undisturbed(processes):
                 result = self._optimise(trainer, folder, console)
             with waiting(console, f"Drawing pictures into {self.output}"):
                 write_report(folder, result, capture)
@@ -174,13 +175,11 @@ class Fit:
 def _said_once(processes: Processes) -> Iterator[None]:
     """Context in which an error is raised by the first process alone that meets with one; others leave in silence."""
     try:
-        yield
+        with _undisturbed(processes):
+            yield
     except BaseException as end:
         if processes.count == 1:
             raise
-        # Once a process has left, who has started them asks the others to: they do, but first say why.
-        with contextlib.suppress(ValueError):  # of threads, to which no signals come
-            signal.signal(signal.SIGTERM, signal.SIG_IGN)
         said_first = processes.speaks_first()
         cause = _mendable(end)
         if cause is None:
@@ -188,6 +187,21 @@ def _said_once(processes: Processes) -> Iterator[None]:
         if said_first:
             raise cause from None
         raise SystemExit(_BAD_INPUT) from end
+
+
+@contextlib.contextmanager
+def _undisturbed(processes: Processes) -> Iterator[None]:
+    """Context that errors leave without being asked to end: a launcher asks all processes once one of them has left.
+
+    They do end, but first tidy up and say why.
+    """
+    try:
+        yield
+    except BaseException:
+        if processes.count > 1:
+            with contextlib.suppress(ValueError):  # of threads, to which no signals come
+                signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        raise
 
 
 def _mendable(end: BaseException) -> Exception | None:
