@@ -43,7 +43,7 @@ _RANGES = {
 _BACKGROUNDS = ("black", "white", "random")
 _STARTS = ("grid", "hull", "points")
 _DEFAULT_CELLS, _DEFAULT_ITERATIONS = 20_000, 2400
-_PHOTO_BANDS, _PHOTO_ITERATIONS = 2, 4800
+_PHOTO_BANDS, _PHOTO_ITERATIONS, _PHOTO_DENSITY_RATE = 2, 4800, 5.0
 _PHOTO_PIXELS_PER_CELL = 12
 _FREE_BEFORE_POINTS, _FREE_BEFORE_BOUNDS = 0.8, 0.5
 _MOST_PHOTO_CELLS = 1_000_000
@@ -54,6 +54,7 @@ _CHOICES_FOR_VOLUMES: dict[str, Any] = {
     "iterations": _DEFAULT_ITERATIONS,
     "background": "black",
     "harmonics": 0,
+    "density_rate": 1.0,
     "free_space": 0.0,
 }
 CHOSEN_FOR_CAPTURE = tuple(_CHOICES_FOR_VOLUMES)
@@ -107,6 +108,9 @@ class FitConfig:
     else 0."""
     harmonics_rate: float = 0.2
     """Learning rate of their coefficients, in units of that of colours."""
+    density_rate: float | None = None
+    """Learning rate of densities, in units of that of colours; default: 5 for photographs, whose surfaces are many
+    times denser than fog that a picture could show, else 1."""
     rate: float = 0.03
     """Learning rate of the first step."""
     final_rate: float = 0.001
@@ -153,8 +157,9 @@ class FitConfig:
         for name, (least, most) in _RANGES.items():
             value = getattr(self, name)
             require(value is None or least <= value <= most, name, value, f"at least {least} and at most {most}")
-        for name in ("rate", "final_rate", "harmonics_rate"):
-            require(_positive(getattr(self, name)), name, getattr(self, name), "greater than 0 and finite")
+        for name in ("rate", "final_rate", "harmonics_rate", "density_rate"):
+            value = getattr(self, name)
+            require(value is None or _positive(value), name, value, "greater than 0 and finite")
         for name in ("haze_penalty", "sparsity", "initial_density", "checkpoint_seconds"):
             value = getattr(self, name)
             require(value >= 0 and math.isfinite(value), name, value, "at least 0 and finite")
@@ -226,6 +231,7 @@ class FitConfig:
             "iterations": _PHOTO_ITERATIONS,
             "background": "random" if capture.is_cut_out else "black",
             "harmonics": _PHOTO_BANDS,
+            "density_rate": _PHOTO_DENSITY_RATE,
             "free_space": free_space if capture.surroundings > 1.0 else 0.0,
         }
 

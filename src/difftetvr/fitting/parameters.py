@@ -61,7 +61,7 @@ class FieldParameters:
             harmonics[:, :shared] = initial.harmonics.detach()[:, :shared]
         self.color, self.density = color.requires_grad_(), density.requires_grad_()
         self.harmonics = None if harmonics is None else harmonics.requires_grad_()
-        self._shares = [1.0, config.harmonics_rate]
+        self._shares = [1.0, config.density_rate or 1.0, config.harmonics_rate]
         groups = [{"params": group} for group in self._groups() if group]
         self._optimizer = torch.optim.Adam(groups, lr=config.rate, betas=config.betas, eps=_EPSILON, fused=True)
         # Adam would make its state in the first step; made here, a checkpoint holds the same arrays from the start.
@@ -198,7 +198,7 @@ class FieldParameters:
 
     def _groups(self) -> list[list[torch.Tensor]]:
         """Parameters that share a learning rate."""
-        return [[self.color, self.density], [] if self.harmonics is None else [self.harmonics]]
+        return [[self.color], [self.density], [] if self.harmonics is None else [self.harmonics]]
 
     def _items(self) -> Iterator[tuple[str, torch.Tensor]]:
         yield "color", self.color
