@@ -184,3 +184,37 @@ def test_the_device_must_come_before_drjit(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setitem(sys.modules, "drjit", sys)
     with pytest.raises(build.BuildError, match="prepare the device first"):
         build.prepare()
+
+
+@pytest.mark.gpu
+def test_copies_between_host_and_device_are_counted() -> None:
+    if "cuda_emulation.started" not in sys.modules:
+        pytest.skip("a GPU's driver does not count")
+    import torch
+    from cuda_emulation.torch_device import WAITS
+    from cuda_emulation.transfers import copies_of
+
+    from difftetvr.backend import get_backend
+
+    here = torch.arange(1000.0)
+    there, backend = here.to("cuda"), get_backend("cuda")
+    array = backend.floats(there) + 1.0
+    target = torch.empty(1000)
+    kinds = {
+        "PyTorch: arrays to the device": lambda: here.to("cuda"),
+        "PyTorch: numbers to the device": lambda: there[torch.tensor([3, 5])],
+        "PyTorch: numbers to the host": lambda: there.sum().item(),
+        "PyTorch: arrays to the host": lambda: target.copy_(there),
+        "Dr.Jit: arrays to the device": lambda: backend.Float(here.numpy()),
+        "Dr.Jit: numbers to the host": lambda: backend.run(array) or array[7],
+    }
+    for kind, call in kinds.items():
+        found = copies_of(call)
+        assert found.pop(kind) == 1 and all(": bytes to the " in other for other in found), (kind, found)
+    assert copies_of(lambda: there[3:9].clone().to("cuda", torch.float64)) == {}
+    waited = WAITS.copy()
+    there.copy_(here, non_blocking=True)
+    here.to("cuda", non_blocking=True)
+    assert waited == WAITS
+    here.to("cuda")
+    assert WAITS - waited == {"copy to the device": 1}

@@ -2,7 +2,7 @@
 
 As on a GPU, operations that mix devices raise, NumPy takes no such tensor, views that begin in the midst of a packet
 stay there, reduced precision of matrix products is heeded, and autograd runs the backward pass on a thread of its own.
-``WAITS`` counts the operations for which a host waits.
+``WAITS`` counts the operations for which a host waits, ``TRANSFERS`` what they carry between host and device.
 """
 
 from __future__ import annotations
@@ -24,10 +24,16 @@ from cuda_emulation import build
 WAITS: Counter[str] = Counter()
 """How often a host has waited in PyTorch, by the operation."""
 
+TRANSFERS: Counter[str] = Counter()
+"""Copies between the memories of host and device in PyTorch, and their bytes, by what and where to."""
+
+MOST_BYTES_OF_NUMBERS = 512
+"""A copy of no more is one of numbers, of more one of an array; the driver counts by the same."""
+
 _ATEN = torch.ops.aten
 _MOVES = (_ATEN.copy_.default, _ATEN._to_copy.default)
 _INDEXING = (_ATEN.index.Tensor, _ATEN.index_put_.default, _ATEN.index_put.default, _ATEN._index_put_impl_.default)
-_WAITING = ("_local_scalar_dense", "nonzero", "unique", "masked_select", "repeat_interleave", "equal")
+_WAITING = ("_local_scalar_dense", "nonzero", "unique", "masked_select", "repeat_interleave", "equal", "bincount")
 _PRODUCTS = (_ATEN.mm.default, _ATEN.bmm.default, _ATEN.addmm.default, _ATEN.baddbmm.default)
 _TF32_DROPS = 13  # of the 23 bits of a float32's fraction
 
@@ -91,7 +97,8 @@ def _run(function: Any, args: Any, kwargs: Any) -> Any:
         return function(*args, **kwargs)
     if ours:
         _require_one_device(function, args, flat)
-    _count_waits(function, args, ours, asked)
+    _count_waits(function, args)
+    _count_transfers(function, args, kwargs, flat)
     lowered = [_lowered(x) for x in flat]
     if function in _PRODUCTS and torch.backends.cuda.matmul.allow_tf32:
         lowered = [_as_tf32(x) for x in lowered]
@@ -124,14 +131,41 @@ def _is_stranger(x: Any) -> bool:
     return isinstance(x, torch.Tensor) and not isinstance(x, EmulatedTensor) and x.dim() > 0
 
 
-def _count_waits(function: Any, args: Any, ours: list[EmulatedTensor], asked: torch.device | None) -> None:
+def _count_waits(function: Any, args: Any) -> None:
     name = function.__name__
-    has_masks = function is _ATEN.index.Tensor and any(x is not None and x.dtype == torch.bool for x in args[1])
-    if has_masks or any(waiting in name for waiting in _WAITING):
+    has_masks = function in _INDEXING and any(x is not None and x.dtype == torch.bool for x in args[1])
+    # One number put where a mask is true needs no places.
+    fills = has_masks and len(args) > 2 and args[2].numel() == 1
+    if (has_masks and not fills) or any(waiting in name for waiting in _WAITING):
         WAITS[name] += 1
-    leaves = function is _ATEN._to_copy.default and ours and asked is not None and asked.type == "cpu"
-    if leaves or (function is _ATEN.copy_.default and not isinstance(args[0], EmulatedTensor)):
-        WAITS["copy to the CPU"] += 1
+
+
+def _count_transfers(function: Any, args: Any, kwargs: Any, flat: list[Any]) -> None:
+    if function is _ATEN._local_scalar_dense.default:
+        _count_transfer("host", args[0])
+    elif function in _MOVES:
+        is_copy = function is _ATEN.copy_.default
+        source, asked = args[1 if is_copy else 0], kwargs.get("device")
+        comes_here = isinstance(args[0], EmulatedTensor) if is_copy else asked is not None and asked.type == "cuda"
+        stays = not is_copy and asked is None
+        if stays or isinstance(source, EmulatedTensor) == comes_here:
+            return
+        _count_transfer("device" if comes_here else "host", source)
+        # Without this word a host waits until a copy is done; into its own memory it does, too, as that is not locked.
+        if not (comes_here and (kwargs.get("non_blocking") or (is_copy and args[2:3] == (True,)))):
+            WAITS[f"copy to the {'device' if comes_here else 'CPU'}"] += 1
+    else:
+        # Indices that come from the CPU are copied, but a number by itself is an argument of the kernel.
+        for x in flat:
+            if _is_stranger(x):
+                _count_transfer("device", x)
+                WAITS["copy to the device"] += 1
+
+
+def _count_transfer(target: str, source: torch.Tensor) -> None:
+    if source.nbytes:
+        TRANSFERS[f"{'arrays' if source.nbytes > MOST_BYTES_OF_NUMBERS else 'numbers'} to the {target}"] += 1
+        TRANSFERS[f"bytes to the {target}"] += source.nbytes
 
 
 def _lowered(x: Any) -> Any:

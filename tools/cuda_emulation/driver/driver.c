@@ -47,10 +47,15 @@ static void give_up(const char *what, const char *of) {
 
 /* ---- Counts of what a host pays for ---------------------------------------------------------------------------- */
 
-enum { LAUNCHES, ALLOCATIONS, STREAM_WAITS, CONTEXT_WAITS, EVENT_WAITS, COPY_WAITS, COPIES, FILLS, COUNTS };
+enum {
+    LAUNCHES, ALLOCATIONS, STREAM_WAITS, CONTEXT_WAITS, EVENT_WAITS, COPY_WAITS, COPIES, FILLS,
+    NUMBERS_UP, ARRAYS_UP, BYTES_UP, NUMBERS_DOWN, ARRAYS_DOWN, BYTES_DOWN, COUNTS
+};
 static const char *const count_names[COUNTS] = {
     "kernel launches", "allocations", "waits for a stream", "waits for the context", "waits for an event",
     "waits for a copy", "asynchronous copies", "fills",
+    "numbers to the device", "arrays to the device", "bytes to the device",
+    "numbers to the host", "arrays to the host", "bytes to the host",
 };
 static unsigned long counts[COUNTS];
 
@@ -155,22 +160,31 @@ EXPORT int cuLaunchHostFunc(UNUSED void *stream, void (*function)(void *), void 
 
 /* ---- Memory ---------------------------------------------------------------------------------------------------- */
 
-enum { ALIGNMENT = 256, UNINITIALISED = 0xCD };
+enum { ALIGNMENT = 256, UNINITIALISED = 0xCD, MOST_BYTES_OF_NUMBERS = 512 };
 static size_t used_bytes;
+
+/* What stands before an allocation, of the device's memory or of the host's that the device reads. */
+typedef struct Block {
+    struct Block *next, *previous;
+    size_t bytes;
+    int is_host;
+} Block;
+static Block blocks = {&blocks, &blocks, 0, 0};
 
 static size_t total_bytes(void) { return (size_t) number("EMULATED_CUDA_MEMORY", 1ll << 34); }
 
-/* An allocation's size stands before it. What is read before it is written is no plausible number. */
-static int allocate(void **pointer, size_t bytes) {
+/* What is read before it is written is no plausible number. */
+static int allocate(void **pointer, size_t bytes, int is_host) {
     int result = OUT_OF_MEMORY;
     bytes = (bytes / ALIGNMENT + 1) * ALIGNMENT;
     pthread_mutex_lock(&lock);
     counts[ALLOCATIONS]++;
-    char *base = used_bytes + bytes <= total_bytes() ? aligned_alloc(ALIGNMENT, bytes + ALIGNMENT) : NULL;
-    if (base) {
-        *(size_t *) base = bytes;
+    Block *block = used_bytes + bytes <= total_bytes() ? aligned_alloc(ALIGNMENT, bytes + ALIGNMENT) : NULL;
+    if (block) {
+        *block = (Block) {blocks.next, &blocks, bytes, is_host};
+        block->next->previous = blocks.next = block;
         used_bytes += bytes;
-        *pointer = memset(base + ALIGNMENT, UNINITIALISED, bytes);
+        *pointer = memset((char *) block + ALIGNMENT, UNINITIALISED, bytes);
         result = SUCCESS;
     }
     pthread_mutex_unlock(&lock);
@@ -179,12 +193,35 @@ static int allocate(void **pointer, size_t bytes) {
 
 static int release(void *pointer) {
     if (!pointer) return SUCCESS;
-    char *base = (char *) pointer - ALIGNMENT;
+    Block *block = (Block *) ((char *) pointer - ALIGNMENT);
     pthread_mutex_lock(&lock);
-    used_bytes -= *(size_t *) base;
+    used_bytes -= block->bytes;
+    block->next->previous = block->previous;
+    block->previous->next = block->next;
     pthread_mutex_unlock(&lock);
-    free(base);
+    free(block);
     return SUCCESS;
+}
+
+/* Whether memory is the host's: what it has not been given by us is, too, where the host waits for a copy of it. Else
+ * it is a tensor of PyTorch's, which says that it is on the device. */
+static int is_of_host(const void *pointer, int waits) {
+    for (Block *block = blocks.next; block != &blocks; block = block->next) {
+        const char *begin = (char *) block + ALIGNMENT;
+        if ((const char *) pointer >= begin && (const char *) pointer < begin + block->bytes) return block->is_host;
+    }
+    return waits;
+}
+
+static void count_copy(const void *target, const void *source, size_t bytes, int waits) {
+    pthread_mutex_lock(&lock);
+    counts[waits ? COPY_WAITS : COPIES]++;
+    int from_host = is_of_host(source, waits), to_host = is_of_host(target, waits);
+    if (from_host != to_host) {
+        counts[(from_host ? NUMBERS_UP : NUMBERS_DOWN) + (bytes > MOST_BYTES_OF_NUMBERS)]++;
+        counts[from_host ? BYTES_UP : BYTES_DOWN] += bytes;
+    }
+    pthread_mutex_unlock(&lock);
 }
 
 EXPORT int cuDeviceTotalMem_v2(size_t *bytes, UNUSED int device) {
@@ -196,9 +233,9 @@ EXPORT int cuMemGetInfo_v2(size_t *unused, size_t *total) {
     *unused = *total - used_bytes;
     return SUCCESS;
 }
-EXPORT int cuMemAlloc_v2(void **pointer, size_t bytes) { return allocate(pointer, bytes); }
-EXPORT int cuMemAllocHost_v2(void **pointer, size_t bytes) { return allocate(pointer, bytes); }
-EXPORT int cuMemAllocAsync(void **pointer, size_t bytes, UNUSED void *stream) { return allocate(pointer, bytes); }
+EXPORT int cuMemAlloc_v2(void **pointer, size_t bytes) { return allocate(pointer, bytes, 0); }
+EXPORT int cuMemAllocHost_v2(void **pointer, size_t bytes) { return allocate(pointer, bytes, 1); }
+EXPORT int cuMemAllocAsync(void **pointer, size_t bytes, UNUSED void *stream) { return allocate(pointer, bytes, 0); }
 EXPORT int cuMemFree_v2(void *pointer) { return release(pointer); }
 EXPORT int cuMemFreeHost(void *pointer) { return release(pointer); }
 EXPORT int cuMemFreeAsync(void *pointer, UNUSED void *stream) { return release(pointer); }
@@ -206,12 +243,12 @@ EXPORT int cuMemAdvise(UNUSED void *pointer, UNUSED size_t bytes, UNUSED int adv
     return SUCCESS;
 }
 EXPORT int cuMemcpy(void *target, const void *source, size_t bytes) {
-    counts[COPY_WAITS]++;
+    count_copy(target, source, bytes, 1);
     memmove(target, source, bytes);
     return SUCCESS;
 }
 EXPORT int cuMemcpyAsync(void *target, const void *source, size_t bytes, UNUSED void *stream) {
-    counts[COPIES]++;
+    count_copy(target, source, bytes, 0);
     memmove(target, source, bytes);
     return SUCCESS;
 }
