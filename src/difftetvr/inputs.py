@@ -91,3 +91,13 @@ def moved(
     except _CONVERSION_FAILS as reason:
         target = " and ".join(shown(place) for place in (device, dtype) if place is not None)
         raise error(f"Tensors cannot be brought to {target} on this machine; choose another device.") from reason
+
+
+def handed_over(tensor: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
+    """A few numbers in the precision and on the device of another tensor, without a wait of the host for a GPU.
+
+    CUDA has read what is in common memory of the host once the call returns; memory that is locked, it reads later.
+    """
+    if tensor.device.type == "cpu" and like.device.type == "cuda":
+        return tensor.to(like.dtype, copy=True).to(like.device, non_blocking=True)
+    return tensor.to(like)

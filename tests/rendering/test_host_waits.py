@@ -18,7 +18,13 @@ def test_a_rendering_and_its_backward_pass_wait_once(name: str) -> None:
     if "cuda_emulation.started" not in sys.modules:
         pytest.skip("a GPU's driver does not count")
     from cuda_emulation.host_waits import calls, waits_of
+    from cuda_emulation.transfers import copies_of
 
-    launches, waits = waits_of(calls()[name])
+    call = calls()[name]
+    launches, waits = waits_of(call)
     assert launches > 0
     assert waits.total() == COUNTED[name], waits
+    # The camera's pose, of six numbers its intrinsics; back comes what says how great the lists must be.
+    copied = {"PyTorch: numbers to the device": 1, "PyTorch: bytes to the device": 64}
+    copied |= {"Dr.Jit: numbers to the device": 1, "Dr.Jit: bytes to the device": 24}
+    assert copies_of(call) == copied | {"Dr.Jit: numbers to the host": 1, "Dr.Jit: bytes to the host": 64}

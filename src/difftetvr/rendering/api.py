@@ -11,7 +11,7 @@ import torch
 
 from difftetvr.backend import eager
 from difftetvr.errors import DiffTetError, shown
-from difftetvr.inputs import as_reals
+from difftetvr.inputs import as_reals, handed_over
 from difftetvr.memory import tried_twice
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.optics import OpticalModel
@@ -212,8 +212,9 @@ def as_background(background: Any, like: torch.Tensor, channels: int = 3) -> tor
     if background is None:
         return None
     advice = "give a tuple or tensor"
-    behind = as_reals(background, "background", DiffTetError, like.dtype, advice).to(like)
+    # Looked at where it comes from, which is the host as a rule: no GPU is waited for.
+    behind = as_reals(background, "background", DiffTetError, like.dtype, advice).to(like.dtype)
     if behind.shape != (channels,) or not bool(torch.isfinite(behind.detach()).all()):
         wanted = "three finite linear RGB components" if channels == 3 else f"one finite number for each of {channels}"
         raise DiffTetError(f"background is {shown(background)}; give {wanted}{'' if channels == 3 else ' channels'}.")
-    return behind
+    return handed_over(behind, like)

@@ -11,7 +11,7 @@ import torch
 
 from difftetvr.backend import Backend, backend_for, require_own_threads
 from difftetvr.errors import DiffTetError, MeshError, shown
-from difftetvr.inputs import as_number, require_type
+from difftetvr.inputs import as_number, handed_over, require_type
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.optics import ConstantPerCell, ExactLinear, OpticalModel
 from difftetvr.rendering.autograd import Shot
@@ -170,11 +170,10 @@ def prepare_view(
     passed: _Passed
     if isinstance(source, Camera):
         shape: tuple[int, ...] = (source.height, source.width)
-        passed = _Passed(mesh.vertices, source.world_to_camera.to(mesh.vertices), parts, 1.0)
+        passed = _Passed(mesh.vertices, handed_over(source.world_to_camera, mesh.vertices), parts, 1.0)
     else:
         shape = tuple(source.shape)
-        places = image_order(shape)
-        order = None if places is None else torch.from_numpy(places).to(mesh.vertices.device)
+        order = image_order(shape, mesh.vertices.device)
         bundle = PreparedRays.of(source, mesh)
         passed = _Passed(mesh.vertices, None, parts, 1.0)
     has_features = isinstance(field, CellFeatures) and content != "cell"
@@ -367,9 +366,10 @@ def _unit_of_length(vertices: torch.Tensor, mesh: TetMesh) -> tuple[torch.Tensor
 
 def _in_unit(bundle: PreparedRays, unit: float, backend: Backend) -> PreparedRays:
     """Rays whose origins are in the unit of kernels, at their precision."""
-    scale = bundle.lines.new_tensor([1.0 / unit] * 3 + [1.0] * 3)
-    lines = (bundle.lines if unit == 1.0 else bundle.lines * scale).to(backend.dtype)
-    return replace(bundle, lines=lines)
+    lines = bundle.lines
+    if unit != 1.0:
+        lines = lines * lines.new_tensor([1.0 / unit] * 3 + [1.0] * 3)
+    return replace(bundle, lines=lines.to(backend.dtype))
 
 
 def _parts_by_unit(content: Content, parts: tuple[torch.Tensor, ...], unit: float) -> tuple[torch.Tensor, ...]:

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, Protocol, runtime_checkable
 
-import numpy as np
 import torch
 
 from difftetvr.errors import CameraError, shown
@@ -41,12 +40,7 @@ class Rays:
             as_reals(getattr(self, name), f"The rays' {name}", CameraError, advice="pass a tensor of shape (..., 3)")
             for name in ("origins", "directions")
         )
-        near, far = (
-            as_reals(
-                getattr(self, name), f"The rays' {name}", CameraError, directions.dtype, "pass a number or tensor"
-            ).to(directions.device)
-            for name in ("near", "far")
-        )
+        near, far = (_end(name, getattr(self, name), directions) for name in ("near", "far"))
         for name, tensor in (("origins", origins), ("directions", directions)):
             if tensor.shape[-1:] != (3,):
                 raise CameraError(f"The rays' {name} have shape {tuple(tensor.shape)}; pass (..., 3).")
@@ -167,26 +161,35 @@ class RaySource(Protocol):
         ...
 
 
-@lru_cache(maxsize=64)
-def image_order(shape: tuple[int, ...]) -> np.ndarray | None:
+def _end(name: str, value: Any, directions: torch.Tensor) -> torch.Tensor:
+    """Where rays begin or end, on their device."""
+    if type(value) is float:
+        return directions.new_full((), value)
+    end = as_reals(value, f"The rays' {name}", CameraError, directions.dtype, "pass a number or tensor")
+    return end.to(directions.device)
+
+
+@lru_cache(maxsize=16)
+def image_order(shape: tuple[int, ...], device: torch.device) -> torch.Tensor | None:
     """Numbers of rays in an order in which neighbours see neighbouring pixels, so that they share cells in cache.
 
     Args:
         shape: Shape of the bundle; the last two dimensions count as rows and columns of images.
+        device: Where they are wanted, and made.
 
     Returns:
-        (N,) int32; None where the rays are no images.
+        (N,) int32, which is shared and must not be changed; None where the rays are no images.
     """
     from difftetvr.rendering.traversal.rays import lane_count, lane_pixel  # late: rays are there without kernels
 
     if len(shape) < 2 or min(shape[-2:]) < _LEAST_SIDE:
         return None
     height, width = shape[-2:]
-    size: Any = _Size((width, height), np.uint32(width), np.uint32(height))
-    column, row, valid = lane_pixel(size, np.arange(lane_count(width, height), dtype=np.uint32))
-    one = (row * np.uint32(width) + column)[valid].astype(np.int64)
-    images = np.arange(math.prod(shape[:-2]))[:, None] * (width * height)
-    return (images + one).reshape(-1).astype(np.int32)
+    size: Any = _Size((width, height), width, height)
+    column, row, valid = lane_pixel(size, torch.arange(lane_count(width, height), device=device))
+    one = (row * width + column)[valid]
+    images = torch.arange(math.prod(shape[:-2]), device=device)[:, None] * (width * height)
+    return (images + one).reshape(-1).int()
 
 
 _LEAST_SIDE = 4
@@ -195,5 +198,5 @@ _LEAST_SIDE = 4
 @dataclass(frozen=True)
 class _Size:
     size: tuple[int, int]
-    width: np.uint32
-    height: np.uint32
+    width: int
+    height: int

@@ -46,11 +46,11 @@ class JudgedPixels:
     def of(capture: Capture, view: int, background: Color) -> JudgedPixels:
         """All pixels of a view, in an order in which neighbours see neighbouring cells."""
         truth = true_image(capture, view, background)
-        rays, order = capture.cameras[view].rays(), image_order(tuple(truth.shape[:2]))
+        rays, order = capture.cameras[view].rays(), image_order(tuple(truth.shape[:2]), truth.device)
         parts = [part.expand(*truth.shape).reshape(1, -1, 3) for part in (rays.origins, rays.directions, truth)]
         valid = None if capture.valid is None else capture.valid[view].reshape(1, -1)
         pixels = JudgedPixels(Rays(*parts[:2]), parts[2], valid, background)
-        return pixels if order is None else pixels._at(torch.from_numpy(order).long())
+        return pixels if order is None else pixels._at(order.long())
 
     @property
     def count(self) -> int:

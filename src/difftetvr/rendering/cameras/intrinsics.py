@@ -10,6 +10,7 @@ import torch
 from difftetvr.rendering.cameras.distortion import Distortion
 
 _AT_ONCE = 1 << 18  # pixels
+_CPU = torch.device("cpu")
 _EDGE = 65  # places along each side of an image by which its field of view is measured
 
 
@@ -72,10 +73,14 @@ class FieldOfView:
     known: torch.Tensor
 
 
+def field_of_view(lens: Intrinsics, device: torch.device = _CPU) -> FieldOfView:
+    """Where the rays of all pixels of a lens go, on a device that knows float64."""
+    return _on_cpu(lens) if device == _CPU else _on_device(lens, device)
+
+
 # The photographs of one camera share it; it is large, so few are kept.
 @lru_cache(maxsize=4)
-def field_of_view(lens: Intrinsics) -> FieldOfView:
-    """Where the rays of all pixels of a lens go."""
+def _on_cpu(lens: Intrinsics) -> FieldOfView:
     distorted = lens.to_normalised(lens.pixel_centers())
     # Some rows at a time: what is needed in between takes many times the memory of the result.
     rows = distorted.split(max(1, _AT_ONCE // lens.width))
@@ -83,6 +88,12 @@ def field_of_view(lens: Intrinsics) -> FieldOfView:
     known = torch.isfinite(directions).all(-1)
     ahead = directions.new_tensor([0.0, 0.0, 1.0])
     return FieldOfView(torch.where(known[..., None], directions, ahead), known)
+
+
+@lru_cache(maxsize=4)
+def _on_device(lens: Intrinsics, device: torch.device) -> FieldOfView:
+    view = _on_cpu(lens)
+    return FieldOfView(view.directions.to(device), view.known.to(device))
 
 
 @lru_cache(maxsize=1024)

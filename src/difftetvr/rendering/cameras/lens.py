@@ -68,7 +68,7 @@ class LensCamera(Camera):
     def ray_directions(self) -> torch.Tensor:
         """(H, W, 3) unit directions of the pixels' rays in camera space, float64; differentiable in all parameters.
 
-        NaN where the lens cannot have made a pixel.
+        They are where the extrinsics are, if that knows float64, and NaN where the lens cannot have made a pixel.
         """
         view = self._field_of_view()
         return torch.where(view.known[..., None], view.directions, torch.nan)
@@ -83,8 +83,8 @@ class LensCamera(Camera):
 
     def _field_of_view(self) -> FieldOfView:
         if self.intrinsics is None and not self.coefficients.requires_grad:
-            return field_of_view(self._numbers)
-        lens = Distortion(self.model, tuple(self.coefficients.double().cpu().unbind()))
+            return field_of_view(self._numbers, self._double_device)
+        lens = Distortion(self.model, tuple(self.coefficients.to(self._double_device, torch.float64).unbind()))
         directions = lens.directions(lens.undistort(self.plane_points()))
         known = torch.isfinite(directions.detach()).all(-1)
         return FieldOfView(torch.where(known[..., None], directions, directions.new_tensor([0.0, 0.0, 1.0])), known)

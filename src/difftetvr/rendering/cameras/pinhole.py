@@ -159,14 +159,18 @@ class Camera:
         return transformed(points, pose[:3, :3], pose[:3, 3])
 
     def ray_directions(self) -> torch.Tensor:
-        """(H, W, 3) unit directions of the pixels' rays in camera space, float64; differentiable in the intrinsics."""
+        """(H, W, 3) unit directions of the pixels' rays in camera space, float64; differentiable in the intrinsics.
+
+        They are where the extrinsics are, if that knows float64.
+        """
         return through_plane(self.plane_points())
 
     def plane_points(self) -> torch.Tensor:
-        """(H, W, 2) where the pixels' centres lie in the plane at distance 1, float64; differentiable likewise."""
-        fx, fy, cx, cy = self._pinhole(torch.float64, "cpu")
-        x = (torch.arange(self.width, dtype=torch.float64) + 0.5 - cx) / fx
-        y = (torch.arange(self.height, dtype=torch.float64) + 0.5 - cy) / fy
+        """(H, W, 2) where the pixels' centres lie in the plane at distance 1, float64; likewise."""
+        device = self._double_device
+        fx, fy, cx, cy = self._pinhole(torch.float64, device)
+        x = (torch.arange(self.width, dtype=torch.float64, device=device) + 0.5 - cx) / fx
+        y = (torch.arange(self.height, dtype=torch.float64, device=device) + 0.5 - cy) / fy
         rows, columns = torch.meshgrid(y, x, indexing="ij")
         return torch.stack([columns, rows], dim=-1)
 
@@ -191,6 +195,12 @@ class Camera:
     def _flattened(self, places: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """(N, 2) where places in camera space are seen in the plane at distance 1, and (N,) by how much enlarged."""
         return Distortion().coordinates(places)
+
+    @property
+    def _double_device(self) -> torch.device:
+        """Where the extrinsics are, if that knows float64, else the CPU."""
+        device = self.world_to_camera.device
+        return device if device.type == "cuda" else torch.device("cpu")
 
     def _pinhole(self, dtype: torch.dtype, device: torch.device | str) -> Sequence[Any]:
         """fx, fy, cx and cy: numbers, or tensors where images are differentiable in them."""
