@@ -7,6 +7,8 @@ operations, and waiting for threads costs a thousand times the work where other 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,6 +29,21 @@ def chunks(count: int, device: torch.device, width: int = 1) -> Iterator[slice]:
     size = max((30_000 if device.type == "cpu" else 2**25) // width, 1)
     for start in range(0, count, size):
         yield slice(start, min(start + size, count))
+
+
+@lru_cache(maxsize=64)
+def constant(values: tuple[Any, ...], device: torch.device) -> torch.Tensor:
+    """A small table of integers, copied to a device once: the host waits for every copy.
+
+    Args:
+        values: Integers, or tuples of them.
+        device: Where it is wanted.
+
+    Returns:
+        int64 of the shape of the values; shared, so it must not be changed.
+    """
+    with torch.inference_mode(False):  # for callers who are not in this mode, too
+        return torch.tensor(values, device=device)
 
 
 def sort_keys(keys: torch.Tensor) -> torch.Tensor:

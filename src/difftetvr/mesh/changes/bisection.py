@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from difftetvr.errors import MeshError
-from difftetvr.mesh.arrays import chunks, true_indices
+from difftetvr.mesh.arrays import chunks, constant, true_indices
 from difftetvr.mesh.changes.change import MeshChange, check_indices, with_midpoints
 from difftetvr.mesh.changes.independent import best_first, independent_set
 from difftetvr.mesh.tetmesh import TetMesh
@@ -174,7 +174,7 @@ def _bisect(mesh: TetMesh, edges: torch.Tensor) -> MeshChange:
 
     rows = true_indices(halved)
     vertex, local_edge = new_vertex[rows].max(1)
-    local_ends = torch.tensor(LOCAL_EDGES, device=rows.device)[local_edge]
+    local_ends = constant(LOCAL_EDGES, rows.device)[local_edge]
     # Every halved cell before this one has moved it by one place.
     lower = rows + torch.arange(rows.shape[0], device=rows.device)
     tets[lower, local_ends[:, 1]] = vertex

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from difftetvr.errors import MeshError
-from difftetvr.mesh.arrays import chunks, true_indices
+from difftetvr.mesh.arrays import chunks, constant, true_indices
 from difftetvr.mesh.changes.change import MeshChange, check_indices, with_midpoints
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.mesh.topology.incidence import cell_edges
@@ -83,7 +83,7 @@ def _subdivide(mesh: TetMesh, is_chosen: torch.Tensor) -> MeshChange:
     ends = edges[true_indices(is_split)]
 
     chosen_corners = is_chosen.index_select(0, tets.view(-1)).view(-1, 4).sum(1)
-    counts = torch.tensor(_CELLS_AFTER, device=tets.device)[chosen_corners]
+    counts = constant(_CELLS_AFTER, tets.device)[chosen_corners]
     first_child = counts.cumsum(0) - counts
     cell_parents = torch.repeat_interleave(counts)
     new_tets = tets.index_select(0, cell_parents)
@@ -95,7 +95,7 @@ def _subdivide(mesh: TetMesh, is_chosen: torch.Tensor) -> MeshChange:
             cells = rows[part]
             points, odd = _canonical(mesh, is_chosen, midpoint, cells)
             pattern = _shortest(positions, points, diagonals)
-            table = torch.tensor(patterns, device=rows.device)[pattern].view(cells.shape[0], -1)
+            table = constant(patterns, rows.device)[pattern].view(cells.shape[0], -1)
             children = points.gather(1, table).view(cells.shape[0], -1, 4)
             children[odd] = children[odd][:, :, [0, 1, 3, 2]]
             places = first_child[cells, None] + torch.arange(children.shape[1], device=rows.device)
@@ -121,7 +121,7 @@ def _canonical(
     keys = (~is_chosen[corners]).long() * mesh.num_vertices + corners
     order = keys.sort(1).indices
     inversions = sum((order[:, i] > order[:, j]).int() for i, j in LOCAL_EDGES)
-    local_edges = torch.tensor(LOCAL_EDGE_OF, device=cells.device)
+    local_edges = constant(LOCAL_EDGE_OF, cells.device)
     columns = torch.stack([local_edges[order[:, i], order[:, j]] for i, j in LOCAL_EDGES], 1)
     middles = midpoint[cell_edges(mesh.topology)[cells].gather(1, columns).long()]
     return torch.cat((corners.gather(1, order).int(), middles), 1), torch.as_tensor(inversions) % 2 == 1

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 
 from difftetvr.errors import MeshError
-from difftetvr.mesh.arrays import chunks, put, sort_keys, true_indices
+from difftetvr.mesh.arrays import chunks, constant, put, sort_keys, true_indices
 
 LOCAL_FACES = ((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1))
 """Local vertices of the face opposite local vertex k, counter-clockwise seen from outside a positive cell."""
@@ -161,7 +161,7 @@ def _face_columns(tets: torch.Tensor, half_faces: torch.Tensor) -> list[torch.Te
     opposite = half_faces & 3
     first = half_faces - opposite
     flat = tets.view(-1)
-    corners = torch.tensor(LOCAL_FACES, device=tets.device).t().contiguous()
+    corners = constant(LOCAL_FACES, tets.device).t().contiguous()
     places = [column.index_select(0, opposite).add_(first) for column in corners]
     return [flat.index_select(0, place) for place in places]
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import torch
 
-from difftetvr.mesh.arrays import sort_keys, true_indices
+from difftetvr.mesh.arrays import constant, sort_keys, true_indices
 from difftetvr.mesh.topology.incidence import boundary_vertices, find_edges, is_corner, shell, stars
 from difftetvr.mesh.topology.topology import LOCAL_FACES, Topology
 
 _PAIRS_AT_ONCE = 2**16
 _LARGEST_RING = 16
 """Most vertices around an edge for which the quick test is made; more are rare."""
-_FOLLOWING = [face[(face.index(j) + 1) % 3] if j in face else 0 for face in LOCAL_FACES for j in range(4)]
+_FOLLOWING = tuple(face[(face.index(j) + 1) % 3] if j in face else 0 for face in LOCAL_FACES for j in range(4))
 """For local vertices i and j at 4 i + j the k with which i, j, k and the fourth have the cell's orientation."""
 _VERTEX_BITS = 32
 _RANK_BITS = 13
@@ -92,7 +92,7 @@ def _rings(
     """
     # All cells have one orientation, so each vertex around the edge follows the ends in one of the cells.
     i, j = ((corners[1] == end) + 2 * (corners[2] == end) + 3 * (corners[3] == end) for end in (first, other))
-    following = torch.tensor(_FOLLOWING, device=owner.device).index_select(0, 4 * i + j)
+    following = constant(_FOLLOWING, owner.device).index_select(0, 4 * i + j)
     vertices = corners.gather(0, following[None])[0]
     row = torch.arange(owner.shape[0], device=owner.device) - (sizes.cumsum(0) - sizes).index_select(0, owner)
     width = min(int(sizes.max()), _LARGEST_RING) if sizes.numel() else 0

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import torch
 
-from difftetvr.mesh.arrays import chunks, sort_keys, true_indices
+from difftetvr.mesh.arrays import chunks, constant, sort_keys, true_indices
 from difftetvr.mesh.topology.incidence import cell_edges
 from difftetvr.mesh.topology.topology import LOCAL_EDGES, Topology
 
 _OTHER_CORNERS = ((2, 3), (3, 1), (1, 2), (0, 3), (2, 0), (0, 1))
 """For each of `LOCAL_EDGES` i, j the other corners x, y, such that x, y, i, j is an even permutation."""
 
+_PATTERNS = tuple((*others, *edge) for others, edge in zip(_OTHER_CORNERS, LOCAL_EDGES, strict=True))
 _PLACE_BITS = 32
 _PLACE_MASK = (1 << _PLACE_BITS) - 1
 
@@ -54,8 +55,7 @@ def _cells_by_edge(table: torch.Tensor, size: int) -> torch.Tensor:
 
 def _corners_around(tets: torch.Tensor, cells: torch.Tensor, local_edges: torch.Tensor) -> torch.Tensor:
     """Corners x, y, i, j of cells (N, K, 4), positively oriented; i, j is the edge, i < j."""
-    pattern = torch.tensor([(*_OTHER_CORNERS[k], *LOCAL_EDGES[k]) for k in range(6)], device=tets.device)
-    places = 4 * cells[..., None] + pattern[local_edges]
+    places = 4 * cells[..., None] + constant(_PATTERNS, tets.device)[local_edges]
     corners = tets.view(-1).index_select(0, places.view(-1)).view(places.shape)
     return torch.where((corners[..., 2] > corners[..., 3])[..., None], corners[..., [1, 0, 3, 2]], corners)
 

@@ -9,6 +9,7 @@ import drjit as dr
 import torch
 
 from difftetvr.mesh import TetMesh
+from difftetvr.mesh.arrays import constant
 from difftetvr.mesh.topology.incidence import cell_edges, cell_faces
 from difftetvr.mesh.topology.topology import LOCAL_EDGE_OF, LOCAL_EDGES, Topology
 from difftetvr.rendering.search.memory_order import MemoryOrder
@@ -70,6 +71,6 @@ def _ranked_tables(topology: Topology, order: MemoryOrder) -> tuple[torch.Tensor
     # Vertices of a cell are ranked by their numbers in memory; their places in the cell are the mesh's.
     ranked = order.topology.tets.argsort(dim=1)
     edges, faces = (table.index_select(0, order.cells) for table in (cell_edges(topology), cell_faces(topology)))
-    local = torch.tensor(LOCAL_EDGE_OF, device=ranked.device)
+    local = constant(LOCAL_EDGE_OF, ranked.device)
     columns = torch.stack([local[ranked[:, i], ranked[:, j]] for i, j in LOCAL_EDGES], 1)
     return torch.gather(edges, 1, columns).contiguous(), torch.gather(faces, 1, ranked).contiguous()
