@@ -21,7 +21,8 @@ from rich.console import Console
 from rich.table import Table
 
 import difftetvr as dtv
-from difftetvr.fitting import trainer as trainer_module
+from difftetvr.capture.truth import Truth
+from difftetvr.fitting import gradients
 from difftetvr.fitting.parameters import FieldParameters
 from difftetvr.fitting.positions import VertexOptimizer
 from difftetvr.fitting.refinement import exchange_round
@@ -31,11 +32,11 @@ from difftetvr.rendering.search import memory_order
 
 ITERATIONS = 2400
 PARTS: dict[str, tuple[Any, str]] = {
-    "rendering": (trainer_module, "render"),
+    "rendering": (gradients, "render"),
     "its backward pass": (torch.Tensor, "backward"),
-    "truth": (trainer_module, "true_image"),
+    "truth": (Truth, "image"),
     "steps of the field": (FieldParameters, "step"),
-    "steps of vertices": (VertexOptimizer, "step"),
+    "steps of vertices": (VertexOptimizer, "advance"),
     "order in memory": (memory_order, "_ordered"),
     "models of images": (Judgement, "model"),
     "flips": (exchange_round._Round, "flip"),

@@ -46,20 +46,22 @@ def shiny() -> dtv.Capture:
 
 def test_what_is_left_open_is_chosen_for_the_images(shiny: dtv.Capture) -> None:
     chosen = dtv.FitConfig().for_capture(shiny)
-    assert (chosen.background, chosen.harmonics) == ("random", 2)
+    assert (chosen.background, chosen.harmonics, chosen.density_rate) == ("random", 2, 5.0)
     assert chosen.evaluation_background() == (1.0, 1.0, 1.0)
     opaque = dataclasses.replace(shiny, alphas=None)
     assert dtv.FitConfig().for_capture(opaque).background == "black"
     light = dataclasses.replace(shiny, encoding="linear")
-    assert (light.encoding, dtv.FitConfig().for_capture(light).harmonics) == ("linear", 0)
-    given = dtv.FitConfig(background="white", harmonics=0, cells=500, start="grid", iterations=9, free_space=0.1)
+    of_light = dtv.FitConfig().for_capture(light)
+    assert (light.encoding, of_light.harmonics, of_light.density_rate) == ("linear", 0, 1.0)
+    options = {"background": "white", "harmonics": 0, "cells": 500, "start": "grid", "iterations": 9}
+    given = dtv.FitConfig(**options, free_space=0.1, density_rate=2.0)
     assert given.for_capture(shiny) == given
     assert dtv.FitConfig.from_json(chosen.to_json()) == chosen
 
 
 def test_directional_colours_are_recovered(shiny: dtv.Capture) -> None:
     options = FAST | {"move": False, "refine": "none", "iterations": 200, "harmonics_rate": 0.5}
-    options |= {"grid": (4, 4, 4), "start": "grid"}  # the truth's
+    options |= {"grid": (4, 4, 4), "start": "grid", "density_rate": 1.0}  # the truth's, and it is no surface
     flat = dtv.fit(shiny, dtv.FitConfig(harmonics=0, **options))
     directional = dtv.fit(shiny, dtv.FitConfig(harmonics=1, **options))
     assert flat.field.harmonics is None

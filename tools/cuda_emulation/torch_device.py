@@ -70,6 +70,10 @@ class EmulatedTensor(torch.Tensor):
         """Where the values are."""
         return self.inner.data_ptr()
 
+    def tolist(self) -> Any:
+        """The values, which are copied to the host at once."""
+        return self.cpu().tolist()
+
     def __dlpack__(self, **_: Any) -> Any:
         """The values as memory of the device, for Dr.Jit."""
         return _moved_capsule(torch._C._to_dlpack(self.inner), _DLPACK_CUDA)

@@ -23,7 +23,7 @@ class PackedImages:
 
     def __getitem__(self, index: Any) -> torch.Tensor:
         """Float32 values in [0, 1] of what the index selects, as for a tensor."""
-        return _unpacked(self.data[index])
+        return unpacked(self.data[index])
 
     def __len__(self) -> int:
         return len(self.data)
@@ -60,8 +60,7 @@ class MixedImages:
 
     def __getitem__(self, view: int) -> torch.Tensor:
         """The values of one view."""
-        values = self.data[view]
-        return _unpacked(values) if values.dtype == torch.uint8 else values
+        return unpacked(self.data[view])
 
     def __len__(self) -> int:
         return len(self.data)
@@ -89,5 +88,14 @@ def shapes_of(values: Images) -> list[tuple[int, ...]]:
     return [tuple(values.shape[1:])] * (values.shape[0] if values.shape else 0)
 
 
-def _unpacked(values: torch.Tensor) -> torch.Tensor:
-    return values.to(torch.float32) / 255.0
+def stored(values: Images | Masks, view: int) -> torch.Tensor:
+    """The values of a view as they are kept, without a copy: bytes, float32, or the bools of masks."""
+    return values[view] if isinstance(values, torch.Tensor) else values.data[view]
+
+
+def unpacked(values: torch.Tensor) -> torch.Tensor:
+    """Values as they are taken: float32 of bytes, 1 of 255, on the device of these; others are as they are."""
+    if values.dtype != torch.uint8:
+        return values
+    # A number of Python's, PyTorch would turn into a product on a GPU, which rounds otherwise than the quotient.
+    return values.to(torch.float32) / torch.full((), 255.0, device=values.device)

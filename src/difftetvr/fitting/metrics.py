@@ -82,7 +82,9 @@ def _comparable(image: torch.Tensor, reference: torch.Tensor) -> tuple[torch.Ten
             "compare images of one size."
         )
     # Float64: the variances of SSIM are differences of nearly equal numbers.
-    a, b = (x.detach().to("cpu", torch.float64).clamp(0.0, 1.0) for x in (image, reference))
+    is_together = image.device == reference.device and image.device.type == "cuda"
+    device = image.device if is_together else torch.device("cpu")
+    a, b = (x.detach().to(device, torch.float64).clamp(0.0, 1.0) for x in (image, reference))
     return a, b
 
 

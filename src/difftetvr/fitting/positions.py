@@ -95,6 +95,20 @@ class VertexOptimizer:
         Raises:
             FitError: There is no gradient, or it is not finite; nothing has changed then.
         """
+        return StepReport(*self.advance(rate).tolist())
+
+    def advance(self, rate: float | None = None) -> torch.Tensor:
+        """What :meth:`step` does; its report stays on the device, so that a loop need not wait for it.
+
+        Args:
+            rate: As for :meth:`step`.
+
+        Returns:
+            (4,) int64, what a :class:`StepReport` holds, in its order.
+
+        Raises:
+            FitError: There is no gradient, or it is not finite; nothing has changed then.
+        """
         rate = self.config.rate if rate is None else rate
         gradient = self._finite_gradient()
         old = self.mesh.vertices.detach()
@@ -103,8 +117,8 @@ class VertexOptimizer:
         move, capped = cap_move(self._constraint.apply(old, move), shapes.altitudes, self.config.cap)
         guarded = guard_move(self.mesh, move, self.config.limits, shapes.cells)
         self.mesh = self.mesh.with_vertices(guarded.vertices.requires_grad_())
-        moved = int((guarded.vertices.detach() != old).any(1).sum())
-        return StepReport(moved, capped, guarded.halved, guarded.refused)
+        moved = (guarded.vertices.detach() != old).any(1).sum()
+        return torch.stack((moved, capped, guarded.halved, guarded.refused))
 
     def carry(self, change: MeshChange) -> None:
         """Follows a change of the mesh's cells; gradients accumulated since the last step are forgotten.

@@ -3,32 +3,34 @@
 from __future__ import annotations
 
 import math
-from dataclasses import astuple, replace
+from dataclasses import replace
 
 import torch
 
 from difftetvr.capture.capture import Capture
-from difftetvr.errors import FitError
+from difftetvr.capture.truth import Truth
+from difftetvr.errors import DiffTetError
 from difftetvr.fitting.beginning.initial_mesh import Start, load_start
 from difftetvr.fitting.beginning.requirements import device_for, require_fittable
 from difftetvr.fitting.beginning.starting_mesh import starting_mesh
 from difftetvr.fitting.config import FitConfig
-from difftetvr.fitting.losses import LOSSES, sparsity
-from difftetvr.fitting.metrics import psnr_of_mse
+from difftetvr.fitting.gradients import ViewGradients
 from difftetvr.fitting.parameters import FieldParameters
-from difftetvr.fitting.positions import StepReport, VertexOptimizer
+from difftetvr.fitting.positions import VertexOptimizer
 from difftetvr.fitting.processes import ALONE, Processes
 from difftetvr.fitting.records.checkpoint import Checkpoint, describe_capture, require_same_capture
-from difftetvr.fitting.records.evaluation import Evaluation, counted_share, evaluate, true_image, where_valid
-from difftetvr.fitting.records.history import History, MoveTotals, RefinementRecord
+from difftetvr.fitting.records.evaluation import Evaluation, compared
+from difftetvr.fitting.records.history import History, RefinementRecord
 from difftetvr.fitting.records.result import Progress
+from difftetvr.fitting.records.unread import Unread
 from difftetvr.fitting.refinement import Moment, Refinement, Situation, Strategy
 from difftetvr.fitting.refinement.pixels import Judgement
 from difftetvr.mesh.tetmesh import TetMesh
-from difftetvr.rendering import render
 from difftetvr.rendering.gauss_newton import ImageModel
 
 _GLANCE_VIEWS = 4
+_READ_EVERY = 25
+"""Iterations from one question to a GPU how they went to the next: the host waits for each answer."""
 _POSITIONS = "positions."  # prefix of the positions' state in a checkpoint
 
 
@@ -43,7 +45,7 @@ class Trainer:
         parameters: Colours and densities under optimisation.
         positions: Vertex positions under optimisation; None where they are fixed.
         iteration: Iterations done.
-        history: What happened so far.
+        history: What happened so far; on a GPU it may lack the latest iterations, see :meth:`catch_up`.
         repair: What mending the initial mesh changed, in words; None where it was not mended.
         starts_from_field: Whether the initial mesh brought colours and densities along.
         processes: Those that fit together; all of them hold the same state.
@@ -91,7 +93,10 @@ class Trainer:
         self.parameters.keep_free(self._free_space.contains(self._sites()))
         self.iteration = 0
         self.history = History()
+        self._unread = Unread()
         self._train_views: list[int] = capture.train_indices.tolist()
+        self._truth = Truth(capture, self._mesh.vertices.device).keep(self._train_views + self._glanced_views())
+        self._gradients = ViewGradients(self._truth, config, self.parameters, processes)
         self._capture_description = describe_capture(capture)
 
     @property
@@ -104,27 +109,41 @@ class Trainer:
         """One iteration: refines the mesh where that is due, renders views, moves parameters and vertices.
 
         Raises:
-            FitError: The loss is not finite.
+            FitError: The loss is not finite; on a GPU, one of the last iterations' may have been it.
         """
+        try:
+            self._iterate()
+        except DiffTetError:
+            self.catch_up()  # what follows a loss that is not finite is no reason, but what came of it
+            raise
+
+    def catch_up(self) -> None:
+        """Completes the history by what a GPU knows of the latest iterations, which is waited for.
+
+        Raises:
+            FitError: The loss of one of them is not finite.
+        """
+        self._unread.read_errors(self.history)
+        self._unread.read_moves(self.history)
+
+    def _iterate(self) -> None:
         self._refine_if_due()
         rate = self._motion_rate()
         mesh = self.positions.mesh if self.positions and rate is not None else self.mesh
-        losses, errors = self._gather_gradients(mesh)
-        if not all(math.isfinite(loss) for loss in losses):
-            raise FitError(
-                f"The loss of iteration {self.iteration} is not finite; check the images or lower the learning rate."
-            )
+        batch = [self._train_views[k] for k in self.config.views_at(self.iteration, len(self._train_views))]
+        self._unread.add(self.iteration, *self._gradients.gather(mesh, batch, self.iteration))
+        is_read = self._is_read()
+        if is_read:
+            self._unread.read_errors(self.history)
         self.parameters.step(self.config.rate_at(self.iteration), self.config.haze_penalty)
         self._move(rate)
-        self.history.loss.append(sum(losses) / len(losses))
-        self.history.psnr.append(psnr_of_mse(sum(errors) / len(errors)))
+        if is_read:
+            self._unread.read_moves(self.history)
         self.iteration += 1
 
     def glance(self) -> None:
         """Notes the mean PSNR over a few held-out views, for the curves; decides nothing."""
-        tested = self.capture.test_indices.tolist()
-        views = tested[:: max(1, math.ceil(len(tested) / _GLANCE_VIEWS))]
-        seen = self.evaluate(views).mean_psnr
+        seen = self.evaluate(self._glanced_views()).mean_psnr
         if seen is not None:
             self.history.evaluations.append((self.iteration, seen))
 
@@ -135,7 +154,7 @@ class Trainer:
             views: Indices of the views to compare.
         """
         mesh, field, background = self.mesh, self.parameters.detached_field(), self.config.evaluation_background()
-        own = [evaluate(mesh, field, self.capture, [view], background).row for view in self.processes.share(views)]
+        own = [compared(mesh, field, self._truth, [view], background).row for view in self.processes.share(views)]
         return Evaluation.of_rows(self.processes.gathered(own, len(views), 3))
 
     def require_agreement(self) -> None:
@@ -152,7 +171,12 @@ class Trainer:
             )
 
     def checkpoint(self) -> Checkpoint:
-        """The state, to be saved."""
+        """The state, to be saved.
+
+        Raises:
+            FitError: A loss on the way to it is not finite.
+        """
+        self.catch_up()
         tensors = {"vertices": self.mesh.vertices, "tets": self.mesh.tets, **self.parameters.state()}
         if self.positions:
             state = self.positions.state()
@@ -225,6 +249,11 @@ class Trainer:
         """Iterations of one pass over the training views."""
         return max(1, len(self._train_views) // self.config.batch)
 
+    def _glanced_views(self) -> list[int]:
+        """A few held-out views, evenly spread."""
+        tested: list[int] = self.capture.test_indices.tolist()
+        return tested[:: max(1, math.ceil(len(tested) / _GLANCE_VIEWS))]
+
     def _budget(self, mesh_is_given: bool) -> int:
         """The options' cells; a given mesh is its own budget, unless the strategy is to make it grow."""
         budget = self.config.budget
@@ -252,11 +281,17 @@ class Trainer:
         if rate is None:
             self.positions.zero_grad()
         elif (self.iteration + 1) % self.config.motion.every == 0:
-            self.history.moves = _added(self.history.moves, self.positions.step(rate))
+            self._unread.add_moves(self.positions.advance(rate))
+
+    def _is_read(self) -> bool:
+        """Whether the history learns now how this iteration went."""
+        is_last = self.iteration + 1 == self.config.steps
+        return self._truth.device.type == "cpu" or self.iteration % _READ_EVERY == 0 or is_last
 
     def _refine_if_due(self) -> None:
         if self.strategy is None or not self.strategy.is_due(self._moment()):
             return
+        self.catch_up()
         with self.processes.in_order():
             self._refine(self.strategy)
         self.require_agreement()
@@ -266,7 +301,7 @@ class Trainer:
         unit = self.capture.density_unit
 
         def model(face_steps: torch.Tensor | None) -> ImageModel:
-            steps = None if face_steps is None else face_steps * face_steps.new_tensor([1.0, 1.0, 1.0, unit])
+            steps = None if face_steps is None else torch.cat((face_steps[:, :3], unit * face_steps[:, 3:]), 1)
             field, deterministic = self.parameters.detached_field(), self.config.deterministic
             return judgement.model(mesh, field, deterministic, steps).with_density_unit(unit)
 
@@ -298,7 +333,7 @@ class Trainer:
         """What a refinement is judged on."""
         positions = self.config.refinement_views_at(self.iteration, views, len(self._train_views))
         judgement = Judgement.of(
-            self.capture,
+            self._truth,
             [self._train_views[position] for position in positions],
             self.mesh,
             self.config.background_at(self.iteration),
@@ -321,68 +356,7 @@ class Trainer:
             self.parameters.add(refinement.surplus, self.capture.density_unit)
 
     def _color_gradients(self) -> torch.Tensor:
-        """(V,) sums over all training views of the absolute derivatives of the loss by the vertices' colours."""
-        background = self.config.background_at(self.iteration)
-        total = torch.zeros_like(self.parameters.density, requires_grad=False)
-        for share in self.processes.shares(self._train_views, self.config.batch):
-            total += self._color_gradients_of(share, background)
-        return self.processes.sum(total)
-
-    def _color_gradients_of(self, views: list[int], background: tuple[float, float, float]) -> torch.Tensor:
-        total = torch.zeros_like(self.parameters.density, requires_grad=False)
-        for view in views:
-            self.parameters.zero_grad()
-            self._accumulate(self.mesh, view, background, 1.0)
-            gradient = self.parameters.color.grad
-            if gradient is not None:
-                total += gradient.abs().sum(1)
-        return total
-
-    def _gather_gradients(self, mesh: TetMesh) -> tuple[list[float], list[float]]:
-        """Adds the mean gradient over the views of this iteration; returns their losses and mean squared errors."""
-        leaves = self.parameters.leaves(self.config.bands_at(self.iteration))
-        leaves += [mesh.vertices] if mesh.vertices.requires_grad else []
-        before = mesh.vertices.grad  # of earlier iterations, in which all processes have a part already
-        for leaf in leaves:
-            leaf.grad = None
-        batch = self.config.views_at(self.iteration, len(self._train_views))
-        background = self.config.background_at(self.iteration)
-        own = [
-            self._accumulate(mesh, self._train_views[position], background, 1.0 / len(batch))
-            for position in self.processes.share(batch)
-        ]
-        rows = self.processes.gathered(own, len(batch), 2)
-        gradients = [torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for leaf in leaves]
-        for leaf, gradient in zip(leaves, self.processes.sum(gradients), strict=True):
-            leaf.grad = gradient
-        if before is not None and mesh.vertices.grad is not None:
-            mesh.vertices.grad = before + mesh.vertices.grad
-        return [loss for loss, _ in rows], [error for _, error in rows]
-
-    def _accumulate(
-        self, mesh: TetMesh, view: int, background: tuple[float, float, float], weight: float
-    ) -> tuple[float, float]:
-        """Adds a view's gradient; returns its loss and mean squared error."""
-        device = mesh.vertices.device
-        truth = true_image(self.capture, view, background).to(device)
-        image = render(
-            mesh,
-            self.parameters.field(self.config.bands_at(self.iteration)),
-            self.capture.cameras[view],
-            background=torch.tensor(background, device=device),
-            deterministic=self.config.deterministic,
-        ).color
-        image = where_valid(self.capture, view, image, truth)
-        share = counted_share(None if self.capture.valid is None else self.capture.valid[view])
-        loss = LOSSES[self.config.loss](image, truth) / share
-        if self.config.sparsity:
-            loss = loss + self.config.sparsity * sparsity(self.parameters.density)
-        (weight * loss).backward()
-        return float(loss.detach()), float((image.detach() - truth).square().mean()) / share
-
-
-def _added(totals: MoveTotals, report: StepReport) -> MoveTotals:
-    return MoveTotals(*(a + b for a, b in zip(astuple(totals), (1, *astuple(report)), strict=True)))
+        return self._gradients.by_colors(self.mesh, self._train_views, self.iteration)
 
 
 def _start(capture: Capture, config: FitConfig, strategy: Strategy | None, mesh: TetMesh | None) -> Start:

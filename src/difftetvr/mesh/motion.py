@@ -25,14 +25,14 @@ class GuardedMove:
         vertices: (V, 3) positions after the allowed part, in the precision of the mesh; the very bits of the old ones
             where a move was refused.
         fraction: (V,) float64 how much of each vertex's move is allowed: 1, 1/2, 1/4, ... or 0.
-        halved: Number of vertices that move by a part of what was proposed only.
-        refused: Number of vertices that were to move, but stay.
+        halved: () int64, number of vertices that move by a part of what was proposed only.
+        refused: () int64, number of vertices that were to move, but stay.
     """
 
     vertices: torch.Tensor
     fraction: torch.Tensor
-    halved: int
-    refused: int
+    halved: torch.Tensor
+    refused: torch.Tensor
 
 
 def measure(mesh: TetMesh) -> CellShapes:
@@ -48,7 +48,7 @@ def measure(mesh: TetMesh) -> CellShapes:
     return CellShapes(scale, *measure_cells(corner_columns(mesh.topology), scaled_points(mesh.vertices, scale)))
 
 
-def cap_move(move: torch.Tensor, altitudes: torch.Tensor, fraction: float) -> tuple[torch.Tensor, int]:
+def cap_move(move: torch.Tensor, altitudes: torch.Tensor, fraction: float) -> tuple[torch.Tensor, torch.Tensor]:
     """Shortens moves that are longer than a fraction of the smallest altitude around their vertex.
 
     Args:
@@ -57,14 +57,14 @@ def cap_move(move: torch.Tensor, altitudes: torch.Tensor, fraction: float) -> tu
         fraction: Longest move in altitudes; as long as it is below 1/4, all volumes stay positive.
 
     Returns:
-        The (V, 3) moves in the same directions, and how many were shortened.
+        The (V, 3) moves in the same directions, and () int64 how many were shortened.
     """
     longest = fraction * altitudes.to(move.dtype)
     # The largest component as the unit: squares of very long moves would overflow, of very short ones vanish.
     unit = move.abs().amax(1).clamp_min(torch.finfo(move.dtype).tiny)
     length = unit * torch.linalg.vector_norm(move / unit[:, None], dim=1)
     too_long = length > longest
-    return torch.where(too_long[:, None], move * (longest / length)[:, None], move), int(too_long.sum())
+    return torch.where(too_long[:, None], move * (longest / length)[:, None], move), too_long.sum()
 
 
 def guard_move(
@@ -113,7 +113,7 @@ def guard_move(
 
     refused = (halvings > limits.halvings) | ~finite
     fraction = torch.where(refused, 0.0, torch.exp2(-halvings.double()))
-    return GuardedMove(new, fraction, int(((halvings > 0) & ~refused).sum()), int(refused.sum()))
+    return GuardedMove(new, fraction, ((halvings > 0) & ~refused).sum(), refused.sum())
 
 
 def _bad_cells(

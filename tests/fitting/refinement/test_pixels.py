@@ -8,6 +8,7 @@ import torch
 
 import difftetvr as dtv
 from difftetvr.capture import Capture
+from difftetvr.capture.truth import Truth
 from difftetvr.fitting.records.evaluation import true_image
 from difftetvr.fitting.refinement import pixels
 from difftetvr.fitting.refinement.pixels import JudgedPixels, Judgement
@@ -32,12 +33,16 @@ def scene(capture: Capture) -> tuple[TetMesh, Field]:
     return mesh, Field(torch.rand(mesh.num_vertices, 3, generator=generator), density)
 
 
+def truth_of(capture: Capture) -> Truth:
+    return Truth(capture, torch.device("cpu"))
+
+
 def judgement(capture: Capture, mesh: TetMesh) -> Judgement:
-    return Judgement.of(capture, VIEWS, mesh, BACKGROUND, np.random.default_rng(0))
+    return Judgement.of(truth_of(capture), VIEWS, mesh, BACKGROUND, np.random.default_rng(0))
 
 
 def test_all_pixels_of_a_view_are_its_image(capture: Capture) -> None:
-    every = JudgedPixels.of(capture, 2, BACKGROUND)
+    every = JudgedPixels.of(truth_of(capture), 2, BACKGROUND)
     assert every.count == 24 * 20
     directions = capture.cameras[2].rays().directions.reshape(-1, 3)
     places = [int((directions == direction).all(1).nonzero()[0]) for direction in every.rays.directions[0]]
@@ -48,7 +53,7 @@ def test_all_pixels_of_a_view_are_its_image(capture: Capture) -> None:
 @pytest.mark.parametrize("count", [1, 7, 100, 479, 480, 1000])
 @pytest.mark.parametrize("begin", [0.0, 0.999])
 def test_chosen_pixels_are_different_and_spread(capture: Capture, count: int, begin: float) -> None:
-    every = JudgedPixels.of(capture, 2, BACKGROUND)
+    every = JudgedPixels.of(truth_of(capture), 2, BACKGROUND)
     some = every.spread(count, begin)
     assert some.count == min(count, every.count)
     assert len(torch.unique(some.rays.directions[0], dim=0)) == some.count
@@ -63,7 +68,7 @@ def test_models_are_means_over_the_views(
     assert [part.count for part in judged.parts] == [24 * 20] * len(VIEWS)
     images = [model_image(mesh, field, capture.cameras[view], true_image(capture, view)) for view in VIEWS]
     expected = (images[0] + images[1] + images[2]).scaled(1 / 3)
-    dealt = Judgement.of(capture, VIEWS, mesh, BACKGROUND, np.random.default_rng(0), shares=2)
+    dealt = Judgement.of(truth_of(capture), VIEWS, mesh, BACKGROUND, np.random.default_rng(0), shares=2)
     assert [len(share) for share in dealt.shares] == [2, 1]
     for found in (one.model(mesh, field, True) for one in (judged, judged.together(), dealt, dealt.together())):
         for kind in ("vertices", "edges", "faces"):

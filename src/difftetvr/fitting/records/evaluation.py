@@ -10,16 +10,11 @@ from typing import Any
 import torch
 
 from difftetvr.capture.capture import Capture
-from difftetvr.errors import CaptureError
+from difftetvr.capture.truth import BLACK, WHITE, Color, Truth
 from difftetvr.fitting.metrics import SSIM_WINDOW, psnr, ssim
 from difftetvr.mesh.field import Field
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.rendering import render
-
-Color = tuple[float, float, float]
-BLACK: Color = (0.0, 0.0, 0.0)
-WHITE: Color = (1.0, 1.0, 1.0)
-_LEAST_SHARE = 1e-6  # of the pixels
 
 
 @dataclass(frozen=True)
@@ -82,45 +77,28 @@ def true_image(capture: Capture, view: int, background: Color = BLACK) -> torch.
     Raises:
         CaptureError: The background is not black and the capture knows no alpha.
     """
-    image = capture.images[view]
-    if background == BLACK:
-        return image
-    if capture.alphas is None:
-        raise CaptureError(
-            f"The images of '{capture.name}' have no alpha, so they cannot be put over the background {background}; "
-            "use a black background."
-        )
-    return image + (1.0 - capture.alphas[view])[..., None] * torch.tensor(background)
+    return _on_host(capture).image(view, background)
 
 
 def where_valid(capture: Capture, view: int, image: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
-    """An image of a view with the truth in the pixels that the capture's mask leaves out."""
-    if capture.valid is None:
-        return image
-    return torch.where(capture.valid[view].to(image.device)[..., None], image, truth)
+    """An image of a view with the truth in the pixels that the capture's mask leaves out, on the CPU."""
+    return _on_host(capture).where_valid(view, image, truth)
 
 
 def valid_share(capture: Capture, view: int) -> float:
     """Share of a view's pixels that the capture's mask does not leave out."""
-    return 1.0 if capture.valid is None else float(capture.valid[view].float().mean())
+    return _on_host(capture).share(view)
 
 
-def counted_share(valid: torch.Tensor | None) -> float:
-    """Share of pixels that count, by which means over all of them are divided; never 0, for then there is no error."""
-    return 1.0 if valid is None else max(float(valid.float().mean()), _LEAST_SHARE)
-
-
-@torch.no_grad()
 def rendered_image(mesh: TetMesh, field: Field, capture: Capture, view: int, background: Color = BLACK) -> torch.Tensor:
     """(H, W, 3) image of the reconstruction from the camera of a view, on the CPU."""
-    behind = torch.tensor(background, device=mesh.vertices.device)
-    return render(mesh, field, capture.cameras[view], background=behind).color.cpu()
+    return _rendered(mesh, field, _on_host(capture), view, background).cpu()
 
 
 def evaluate(
     mesh: TetMesh, field: Field, capture: Capture, views: Sequence[int], background: Color = BLACK
 ) -> Evaluation:
-    """Renders views and compares them with the truth.
+    """Renders views and compares them with the truth, where the mesh is.
 
     Args:
         mesh: The reconstruction's mesh, on any device.
@@ -129,12 +107,27 @@ def evaluate(
         views: Indices of the views to compare; those without any valid pixel are left out.
         background: Linear RGB behind the volume.
     """
+    return compared(mesh, field, Truth(capture, mesh.vertices.device), views, background)
+
+
+def compared(mesh: TetMesh, field: Field, truth: Truth, views: Sequence[int], background: Color = BLACK) -> Evaluation:
+    """What :func:`evaluate` returns, of a capture whose views are known already."""
     psnrs, ssims = [], []
-    views = [view for view in views if valid_share(capture, view) > 0.0]
+    views = [view for view in views if truth.share(view) > 0.0]
     for view in views:
-        truth = true_image(capture, view, background)
-        image = where_valid(capture, view, rendered_image(mesh, field, capture, view, background), truth)
-        psnrs.append(psnr(image, truth, valid_share(capture, view)))
-        if min(truth.shape[:2]) >= SSIM_WINDOW:
-            ssims.append(ssim(image, truth))
+        expected = truth.image(view, background)
+        image = _rendered(mesh, field, truth, view, background).to(truth.device)
+        image = truth.where_valid(view, image, expected)
+        psnrs.append(psnr(image, expected, truth.share(view)))
+        if min(expected.shape[:2]) >= SSIM_WINDOW:
+            ssims.append(ssim(image, expected))
     return Evaluation(views, psnrs, ssims)
+
+
+@torch.no_grad()
+def _rendered(mesh: TetMesh, field: Field, truth: Truth, view: int, background: Color) -> torch.Tensor:
+    return render(mesh, field, truth.camera(view), background=torch.tensor(background)).color
+
+
+def _on_host(capture: Capture) -> Truth:
+    return Truth(capture, torch.device("cpu"))

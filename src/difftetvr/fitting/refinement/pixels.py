@@ -10,9 +10,8 @@ from operator import add
 import numpy as np
 import torch
 
-from difftetvr.capture.capture import Capture
+from difftetvr.capture.truth import Color, Truth, counted_share
 from difftetvr.fitting.processes import ALONE, Processes
-from difftetvr.fitting.records.evaluation import Color, counted_share, true_image
 from difftetvr.mesh.field import Field
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.rendering import Rays, render
@@ -43,13 +42,12 @@ class JudgedPixels:
     views: int = 1
 
     @staticmethod
-    def of(capture: Capture, view: int, background: Color) -> JudgedPixels:
+    def of(truth: Truth, view: int, background: Color) -> JudgedPixels:
         """All pixels of a view, in an order in which neighbours see neighbouring cells."""
-        truth = true_image(capture, view, background)
-        rays, order = capture.cameras[view].rays(), image_order(tuple(truth.shape[:2]), truth.device)
-        parts = [part.expand(*truth.shape).reshape(1, -1, 3) for part in (rays.origins, rays.directions, truth)]
-        valid = None if capture.valid is None else capture.valid[view].reshape(1, -1)
-        pixels = JudgedPixels(Rays(*parts[:2]), parts[2], valid, background)
+        image, rays, valid = truth.image(view, background), truth.rays(view), truth.valid(view)
+        parts = [part.expand(*image.shape).reshape(1, -1, 3) for part in (rays.origins, rays.directions, image)]
+        pixels = JudgedPixels(Rays(*parts[:2]), parts[2], None if valid is None else valid.reshape(1, -1), background)
+        order = image_order(tuple(image.shape[:2]), image.device)
         return pixels if order is None else pixels._at(order.long())
 
     @property
@@ -61,7 +59,8 @@ class JudgedPixels:
         """About as many as are asked for, in equal steps along their order; ``begin`` is in parts of a step."""
         if count >= self.count:
             return self
-        return self._at(((torch.arange(count, dtype=torch.float64) + begin) * (self.count / count)).long())
+        steps = torch.arange(count, dtype=torch.float64, device=self.truth.device)
+        return self._at(((steps + begin) * (self.count / count)).long())
 
     def _at(self, places: torch.Tensor) -> JudgedPixels:
         rays = Rays(self.rays.origins[:, places], self.rays.directions[:, places])
@@ -87,7 +86,7 @@ class JudgedPixels:
     @torch.no_grad()
     def error(self, mesh: TetMesh, field: Field) -> float:
         """Mean squared error."""
-        image = render(mesh, field, self.rays, background=torch.tensor(self.background, device=mesh.vertices.device))
+        image = render(mesh, field, self.rays, background=torch.tensor(self.background))
         squares = (image.color - self.truth.to(image.color)).square()
         if self.valid is not None:
             squares = squares * self.valid.to(squares.device)[..., None]
@@ -110,7 +109,7 @@ class Judgement:
 
     @staticmethod
     def of(
-        capture: Capture,
+        truth: Truth,
         views: Sequence[int],
         mesh: TetMesh,
         background: Color,
@@ -121,7 +120,7 @@ class Judgement:
         """Choose pixels: evenly spread, and as many as predictions about the cells of a mesh need.
 
         Args:
-            capture: Cameras and images.
+            truth: Cameras and images.
             views: The views.
             mesh: The mesh that is to be refined.
             background: Linear RGB behind the volume.
@@ -132,7 +131,7 @@ class Judgement:
         wanted = max(1, round(_CROSSINGS * mesh.num_cells ** (2 / 3) / len(views)))
         chosen = [(view, generator.random()) for view in views]
         own = [
-            [JudgedPixels.of(capture, view, background).spread(wanted, begin) for view, begin in share]
+            [JudgedPixels.of(truth, view, background).spread(wanted, begin) for view, begin in share]
             for share in processes.shares(chosen, shares)
         ]
         return Judgement(own, len(views), processes)
