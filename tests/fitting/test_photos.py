@@ -49,7 +49,8 @@ def test_what_is_left_open_is_chosen_for_the_images(shiny: dtv.Capture) -> None:
     assert (chosen.background, chosen.harmonics, chosen.density_rate) == ("random", 2, 5.0)
     assert chosen.evaluation_background() == (1.0, 1.0, 1.0)
     opaque = dataclasses.replace(shiny, alphas=None)
-    assert dtv.FitConfig().for_capture(opaque).background == "black"
+    of_opaque = dtv.FitConfig().for_capture(opaque)
+    assert (of_opaque.background, of_opaque.density_rate) == ("black", 1.0)
     light = dataclasses.replace(shiny, encoding="linear")
     of_light = dtv.FitConfig().for_capture(light)
     assert (light.encoding, of_light.harmonics, of_light.density_rate) == ("linear", 0, 1.0)

@@ -43,7 +43,8 @@ _RANGES = {
 _BACKGROUNDS = ("black", "white", "random")
 _STARTS = ("grid", "hull", "points")
 _DEFAULT_CELLS, _DEFAULT_ITERATIONS = 20_000, 2400
-_PHOTO_BANDS, _PHOTO_ITERATIONS, _PHOTO_DENSITY_RATE = 2, 4800, 5.0
+_PHOTO_BANDS, _PHOTO_ITERATIONS = 2, 4800
+_CUT_OUT_DENSITY_RATE = 5.0  # what stands before a background would be put where it is seen first, and stay
 _PHOTO_PIXELS_PER_CELL = 12
 _FREE_BEFORE_POINTS, _FREE_BEFORE_BOUNDS = 0.8, 0.5
 _MOST_PHOTO_CELLS = 1_000_000
@@ -109,8 +110,8 @@ class FitConfig:
     harmonics_rate: float = 0.2
     """Learning rate of their coefficients, in units of that of colours."""
     density_rate: float | None = None
-    """Learning rate of densities, in units of that of colours; default: 5 for photographs, whose surfaces are many
-    times denser than fog that a picture could show, else 1."""
+    """Learning rate of densities, in units of that of colours; default: 5 for photographs that alpha cuts out,
+    whose surfaces are many times denser than fog that a picture could show, else 1."""
     rate: float = 0.03
     """Learning rate of the first step."""
     final_rate: float = 0.001
@@ -231,7 +232,7 @@ class FitConfig:
             "iterations": _PHOTO_ITERATIONS,
             "background": "random" if capture.is_cut_out else "black",
             "harmonics": _PHOTO_BANDS,
-            "density_rate": _PHOTO_DENSITY_RATE,
+            "density_rate": _CUT_OUT_DENSITY_RATE if capture.is_cut_out else 1.0,
             "free_space": free_space if capture.surroundings > 1.0 else 0.0,
         }
 
