@@ -79,7 +79,7 @@ def main() -> None:
         command += ["--iterations", str(arguments.iterations)]
         done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
         rows.append(json.loads(done.stdout))
-    table = Table(title=f"{arguments.size} x {arguments.size} pixels")
+    table = Table(title=f"{arguments.size} x {arguments.size} pixels, seconds and peak memory in GiB")
     for heading in rows[0]:
         table.add_column(heading, justify="right")
     for row in rows:
