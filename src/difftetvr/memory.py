@@ -17,9 +17,10 @@ Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
 
 # Torch's and Dr.Jit's allocators raise RuntimeErrors like any others; only their words tell them apart.
+# The last of them is what Dr.Jit says where it has no memory left for a kernel that it records.
 _ALLOCATION = re.compile(
     r"DefaultCPUAllocator|(?:can't|cannot|could not|unable to|failed to) allocate|out[ _]of[ _]memory|not enough memory"
-    r"|bad[_ ]alloc",
+    r"|bad[_ ]alloc|free the allocation cache while recording",
     re.IGNORECASE,
 )
 
