@@ -12,14 +12,11 @@ from typing import Any
 
 import drjit as dr
 
-from difftetvr.recording import replayed
 from difftetvr.rendering.kernels.composition import Composition, Pixels, pixel_adjoint
-from difftetvr.rendering.kernels.gradients import BufferSizes, Gradients, GradientSums, Wanted
-from difftetvr.rendering.kernels.shares import Deal
-from difftetvr.rendering.kernels.walk_adjoint import AdjointRay, WalkAdjoint
+from difftetvr.rendering.kernels.gradients import Gradients, GradientSums, Wanted
+from difftetvr.rendering.kernels.walk_adjoint import AdjointRay, Asked, WalkAdjoint, gradients_by
 from difftetvr.rendering.traversal.crossing import Tracer
 from difftetvr.rendering.traversal.rays import Lanes
-from difftetvr.rendering.traversal.sums import Copies
 
 
 @dataclass
@@ -64,25 +61,7 @@ def render_adjoint(
         wanted: What else needs gradients.
         in_order: Whether sums over rays have a certain order, see :mod:`difftetvr.rendering.kernels.shares`.
     """
-    backend, sizes = tracer.view.backend, BufferSizes.of(tracer.view, vertex_count, wanted)
-    deal = Deal.of(tracer, sizes.floats, in_order)
-    with backend.on_threads(deal.threads):
-        gradients: Gradients = replayed(_adjoint, tracer, image, deal, sizes, sizes.places(backend, deal.copies))
-    return gradients
-
-
-def _adjoint(
-    tracer: Tracer, image: ImageAdjoint, deal: Deal, sizes: BufferSizes, copies: list[Copies | None]
-) -> Gradients:
-    sums = GradientSums.zeros(tracer.view.backend, sizes, copies, deal.mode)
-
-    def run(part: Tracer, copy: Any | None) -> None:
-        part.trace(lambda rays: _AdjointKernel(part, rays, image, sums.of_copy(copy)))
-
-    deal.trace(tracer, run)
-    gradients = sums.total()
-    dr.eval(gradients)
-    return gradients
+    return gradients_by(_AdjointKernel, tracer, image, Asked(vertex_count, wanted, in_order))
 
 
 class _AdjointKernel(WalkAdjoint):

@@ -13,13 +13,11 @@ import drjit as dr
 
 from difftetvr.optics.special import depth_of
 from difftetvr.recording import replayed
-from difftetvr.rendering.kernels.gradients import BufferSizes, Gradients, GradientSums, Wanted
+from difftetvr.rendering.kernels.gradients import Gradients, GradientSums, Wanted
 from difftetvr.rendering.kernels.segments import SegmentKernel
-from difftetvr.rendering.kernels.shares import Deal
-from difftetvr.rendering.kernels.walk_adjoint import AdjointRay, WalkAdjoint
+from difftetvr.rendering.kernels.walk_adjoint import AdjointRay, Asked, WalkAdjoint, gradients_by
 from difftetvr.rendering.traversal.crossing import Tracer, inverse_length
 from difftetvr.rendering.traversal.rays import Lanes
-from difftetvr.rendering.traversal.sums import Copies
 
 
 @dataclass
@@ -127,23 +125,7 @@ def depths_adjoint(
         wanted: What needs gradients beside the field.
         in_order: Whether sums over rays have a certain order, see :mod:`difftetvr.rendering.kernels.shares`.
     """
-    backend, sizes = tracer.view.backend, BufferSizes.of(tracer.view, vertex_count, wanted)
-    deal = Deal.of(tracer, sizes.floats, in_order)
-    with backend.on_threads(deal.threads):
-        gradients: Gradients = replayed(_adjoint, tracer, depths, deal, sizes, sizes.places(backend, deal.copies))
-    return gradients
-
-
-def _adjoint(tracer: Tracer, depths: Weighed, deal: Deal, sizes: BufferSizes, copies: list[Copies | None]) -> Gradients:
-    sums = GradientSums.zeros(tracer.view.backend, sizes, copies, deal.mode)
-
-    def run(part: Tracer, copy: Any | None) -> None:
-        part.trace(lambda rays: _DepthsAdjoint(part, rays, depths, sums.of_copy(copy)))
-
-    deal.trace(tracer, run)
-    gradients = sums.total()
-    dr.eval(gradients)
-    return gradients
+    return gradients_by(_DepthsAdjoint, tracer, depths, Asked(vertex_count, wanted, in_order))
 
 
 def _ask(kernel: type[_ProfileKernel], tracer: Tracer, questions: Table, count: int) -> Answers:

@@ -14,7 +14,9 @@ from typing import Any
 
 import drjit as dr
 
-from difftetvr.rendering.kernels.gradients import GradientSums
+from difftetvr.recording import replayed
+from difftetvr.rendering.kernels.gradients import BufferSizes, Gradients, GradientSums, Wanted
+from difftetvr.rendering.kernels.shares import Deal
 from difftetvr.rendering.traversal.crossing import (
     Clip,
     Span,
@@ -26,6 +28,7 @@ from difftetvr.rendering.traversal.crossing import (
     read_vertex,
 )
 from difftetvr.rendering.traversal.rays import Lanes
+from difftetvr.rendering.traversal.sums import Copies
 from difftetvr.rendering.traversal.transfer import CrossingAdjoint, Piece, PieceAdjoint
 from difftetvr.rendering.traversal.walk import Corner, Face
 
@@ -247,6 +250,52 @@ class WalkAdjoint:
     def _scatter_record(self, sums: Any, index: Any, density: Any, radiance: Any, active: Any) -> None:
         record = [radiance * g for g in self.color] + [density]
         self.view.records.add(self.view.backend, sums, record, index, active)
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What a backward pass is to find.
+
+    Attributes:
+        vertex_count: Number of vertices V.
+        wanted: What needs gradients beside the field.
+        in_order: Whether sums over rays have a certain order, see :mod:`difftetvr.rendering.kernels.shares`.
+    """
+
+    vertex_count: int
+    wanted: Wanted
+    in_order: bool
+
+
+def gradients_by(kernel: Any, tracer: Tracer, derivatives: Any, asked: Asked) -> Gradients:
+    """What an adjoint gathers from all rays.
+
+    Args:
+        kernel: Class of a :class:`WalkAdjoint`, made of tracer, rays, derivatives and sums.
+        tracer: The tracer that the walk before saw.
+        derivatives: Of the loss by what that walk had found; made of what :func:`difftetvr.recording.replayed` takes.
+        asked: What is to be found.
+    """
+    backend, sizes = tracer.view.backend, BufferSizes.of(tracer.view, asked.vertex_count, asked.wanted)
+    deal = Deal.of(tracer, sizes.floats, asked.in_order)
+    places = sizes.places(backend, deal.copies)
+    with backend.on_threads(deal.threads):
+        gradients: Gradients = replayed(_gather, kernel, tracer, derivatives, deal, sizes, places)
+    return gradients
+
+
+def _gather(
+    kernel: Any, tracer: Tracer, derivatives: Any, deal: Deal, sizes: BufferSizes, copies: list[Copies | None]
+) -> Gradients:
+    sums = GradientSums.zeros(tracer.view.backend, sizes, copies, deal.mode)
+
+    def run(part: Tracer, copy: Any | None) -> None:
+        part.trace(lambda rays: kernel(part, rays, derivatives, sums.of_copy(copy)))
+
+    deal.trace(tracer, run)
+    gradients = sums.total()
+    dr.eval(gradients)
+    return gradients
 
 
 def _unclip(clip: Clip, step: Step, at_start: list[Any], at_end: list[Any]) -> tuple[list[Any], list[Any], list[Any]]:
