@@ -53,7 +53,7 @@ class Upload:
 
     def scene(self, records: Any, rays: Any) -> Scene:
         """The cells, with laid out vertices, in the space of some rays."""
-        return Scene(self.vertices.backend, records, self.tables.tets, rays, self.vertices.stride)
+        return Scene(self.vertices.backend, records, self.tables.tets, self.vertices.stride, rays)
 
 
 @dataclass(frozen=True)
@@ -159,7 +159,7 @@ def _lay_out_and_count(
 ) -> _Found:
     backend: Backend = vertices.backend
     records, cell_records, extent = _lay_out(vertices, cells, *lengths)
-    scene = Scene(backend, records, tables.tets, rays, vertices.stride)
+    scene = Scene(backend, records, tables.tets, vertices.stride, rays)
     search = CameraSearch.of(scene, tables, lanes, extent)
     counts = count_entries(search, rays.count)
     # One array, for one wait; halves, for floats do not hold all integers.

@@ -32,7 +32,8 @@ class CellReader(Cells):
     @staticmethod
     def of(backend: Backend, mesh: TetMesh, vertices: torch.Tensor) -> CellReader:
         """Upload a mesh with (V, 3) vertices."""
-        return CellReader(backend, backend.floats(vertices), backend.uints(mesh.tets))
+        records = torch.nn.functional.pad(vertices.detach(), (0, 1))
+        return CellReader(backend, backend.floats(records), backend.uints(mesh.tets), 1)
 
     def corners(self, cell: Any, active: Any = True) -> tuple[Any, list[list[Any]]]:
         """The four vertices of a cell, and their positions."""
@@ -51,13 +52,14 @@ class CellReader(Cells):
         )
         return [volume * inverse for volume in volumes], _TOLERANCE * dr.epsilon(size) * size * dr.abs(inverse)
 
-    def holds(self, corners: list[list[Any]], point: list[Any]) -> Any:
-        """Whether a cell with some corners holds a point, but for rounding."""
+    def holds(self, corners: list[list[Any]], point: list[Any]) -> tuple[Any, Any]:
+        """Whether a cell with some corners holds a point, but for rounding; and whether no other cell does."""
         weights, slack = self.weights(corners, point)
-        inside = weights[0] >= -slack
-        for weight in weights[1:]:
-            inside &= weight >= -slack
-        return inside
+        is_in, is_alone = weights[0] >= -slack, weights[0] > slack
+        for weight in weights[1:]:  # not of their least one: that of NaN and a number is the number
+            is_in &= weight >= -slack
+            is_alone &= weight > slack
+        return is_in, is_alone
 
 
 def locate(mesh: TetMesh, vertices: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
@@ -82,12 +84,18 @@ def locate(mesh: TetMesh, vertices: torch.Tensor, points: torch.Tensor) -> torch
         lane = dr.arange(uint, count)
         point = [dr.gather(backend.Float, flat, 3 * lane + axis) for axis in range(3)]
 
-        def at_cell(cell: Any, active: Any, best: Any) -> Any:
+        def at_cell(cell: Any, active: Any, state: tuple[Any, Any]) -> tuple[Any, Any]:
+            best, is_settled = state
             _, corners = reader.corners(cell, active)
-            return dr.select(active & reader.holds(corners, point) & (cell < best), cell, best)
+            is_in, is_alone = reader.holds(corners, point)
+            best = dr.select(active & is_in & ~is_settled & (is_alone | (cell < best)), cell, best)
+            return best, is_settled | (active & is_alone)
 
-        best = dr.full(uint, 0xFFFFFFFF, count)
-        best = hierarchy.meet_points((point[0], point[1], point[2]), 0.0, dr.mask_t(point[0])(True), at_cell, best)
+        everywhere = dr.full(backend.Bool, True, count)
+        state = dr.full(uint, 0xFFFFFFFF, count), dr.full(backend.Bool, False, count)
+        best, _ = hierarchy.meet_points(
+            (point[0], point[1], point[2]), 0.0, everywhere, at_cell, state, lambda state: state[1]
+        )
         found = backend.tensor(backend.Int(best))
         return torch.empty_like(found).index_put_((order,), found)
 
@@ -160,7 +168,7 @@ def locate_lattice(mesh: TetMesh, vertices: torch.Tensor, lattice: Lattice) -> t
             place = [x0 + x, y0 + y, z0 + z]
             point = [dr.fma(real(i), s, f) for i, s, f in zip(place, step, first, strict=True)]
             index = (place[0] * size[1] + place[1]) * size[2] + place[2]
-            dr.scatter_reduce(dr.ReduceOp.Min, owners, cell, index, reader.holds(corners, point))
+            dr.scatter_reduce(dr.ReduceOp.Min, owners, cell, index, reader.holds(corners, point)[0])
             ends = z + 1 >= depth
             return dr.select(ends, column + 1, column), dr.select(ends, 0, z + 1)
 

@@ -134,7 +134,13 @@ class Hierarchy:
         return self._visit(meets, active, visit, state)
 
     def meet_points(
-        self, point: tuple[Any, Any, Any], slack: float, active: Any, visit: Callable[[Any, Any, Any], Any], state: Any
+        self,
+        point: tuple[Any, Any, Any],
+        slack: float,
+        active: Any,
+        visit: Callable[[Any, Any, Any], Any],
+        state: Any,
+        is_done: Callable[[Any], Any] | None = None,
     ) -> Any:
         """Visit all items whose boxes hold a point, or nearly so.
 
@@ -144,6 +150,7 @@ class Hierarchy:
             active: Which of them.
             visit: Takes an item, a mask and the state, and returns the new state.
             state: A PyTree as wide as the points.
+            is_done: Takes the state, and tells which points need no more items; None where all do.
         """
         margin = self._margin(point)
 
@@ -154,14 +161,19 @@ class Hierarchy:
                 is_in &= dr.abs(x - c) <= h + around
             return is_in
 
-        return self._visit(holds, active, visit, state)
+        return self._visit(holds, active, visit, state, is_done)
 
     def _margin(self, point: tuple[Any, Any, Any]) -> Any:
         farthest = dr.fmax(dr.fmax(dr.abs(point[0]), dr.abs(point[1])), dr.abs(point[2]))
         return rounding_of(farthest + self.size)
 
     def _visit(
-        self, test: Callable[[list[Any], list[Any]], Any], active: Any, visit: Callable[..., Any], state: Any
+        self,
+        test: Callable[[list[Any], list[Any]], Any],
+        active: Any,
+        visit: Callable[..., Any],
+        state: Any,
+        is_done: Callable[[Any], Any] | None = None,
     ) -> Any:
         uint, float4 = self.backend.UInt, self.backend.Float4
 
@@ -185,7 +197,8 @@ class Hierarchy:
             state = dr.if_stmt((node, state), is_met & is_leaf, at_leaf, lambda _, state: state)
             behind = node + 1
             behind >>= dr.tzcnt(behind)
-            return dr.select(is_met & ~is_leaf, 2 * node, dr.select(behind == 1, uint(0), behind)), state
+            ends = behind == 1 if is_done is None else (behind == 1) | is_done(state)
+            return dr.select(is_met & ~is_leaf, 2 * node, dr.select(ends, uint(0), behind)), state
 
         root = dr.select(active, uint(1), uint(0))
         return dr.while_loop((root, state), lambda node, _: node != 0, body)[1]

@@ -27,17 +27,20 @@ class Cells:
 
     Attributes:
         backend: Array types.
-        vertices: Flat (V, 3) positions.
+        vertices: Flat (V, 4 ``stride``) records, which begin with x, y and z.
         tets: Flat (T, 4) cells.
+        stride: Packets of four floats a record.
     """
 
     backend: Backend
     vertices: Any
     tets: Any
+    stride: int
 
     def point(self, vertex: Any, mask: Any = True) -> list[Any]:
         """Position of a vertex."""
-        return [dr.gather(self.backend.Float, self.vertices, 3 * vertex + axis, mask) for axis in range(3)]
+        record = dr.gather(self.backend.Float4, self.vertices, self.stride * vertex, mask)
+        return [record[0], record[1], record[2]]
 
     def cell(self, cell: Any, mask: Any = True) -> Any:
         """The four vertices of a cell."""
@@ -49,18 +52,10 @@ class Scene(Cells):
     """The cells of a mesh in the space of some rays that may cross them.
 
     Attributes:
-        vertices: Flat (V, 4 ``stride``) records, which begin with x, y and z.
         rays: The rays.
-        stride: Packets of four floats a record.
     """
 
     rays: KernelRays
-    stride: int
-
-    def point(self, vertex: Any, mask: Any = True) -> list[Any]:
-        """Position of a vertex."""
-        record = dr.gather(self.backend.Float4, self.vertices, self.stride * vertex, mask)
-        return [record[0], record[1], record[2]]
 
     @property
     def image(self) -> ImageRays:
