@@ -103,8 +103,41 @@ def test_colours_that_depend_on_the_direction() -> None:
     both = render(mesh, seen, [OUTSIDE, INSIDE])
     assert isinstance(both, RenderedImage)
     assert_same(both[1], render(mesh, seen, INSIDE), 2e-6)
+    with pytest.raises(DiffTetError, match="start at 1,025 points"):
+        render(mesh, seen, Rays(*random_rays(1025)))
     with pytest.raises(DiffTetError, match="start at one point"):
-        render(mesh, seen, Rays(*random_rays(8)))
+        dtv.rendering.gauss_newton.model_image(mesh, seen, Rays(*random_rays(8)), torch.ones(8, 3), torch.ones(8, 3))
+
+
+def test_rays_of_several_cameras_mixed_see_what_each_camera_sees() -> None:
+    """Also where harmonics give each point of view its own colours; with their derivatives."""
+    mesh, field = scene()
+    harmonics = torch.randn(mesh.num_vertices, 8, 3, dtype=torch.float64).requires_grad_()
+    seen = Field(field.color, field.density, harmonics=harmonics)
+    views = [OUTSIDE, INSIDE, Camera.look_at((-2.0, 0.3, 1.2), (0.5, 0.5, 0.5), width=9, height=8)]
+    both = Rays.joined([camera.rays() for camera in views])
+    shuffle = torch.randperm(both.shape[0])[: both.shape[0] // 4 * 4].reshape(-1, 4)
+    mixed = Rays(both.origins[shuffle], both.directions[shuffle])
+    expected = torch.cat([render(mesh, seen, camera.rays()).color.reshape(-1, 3) for camera in views])[shuffle]
+    found = render(mesh, seen, mixed).color
+    assert found.shape == (*shuffle.shape, 3)
+    torch.testing.assert_close(found, expected, rtol=0.0, atol=1e-9)
+    weight = torch.randn_like(found)
+    (one,) = torch.autograd.grad((found * weight).sum(), harmonics)
+    (other,) = torch.autograd.grad((expected * weight).sum(), harmonics)
+    torch.testing.assert_close(one, other, rtol=0.0, atol=1e-9)
+
+
+def test_parallel_rays_see_colours_of_their_direction() -> None:
+    """As a pinhole camera does from very far away."""
+    mesh, field = scene()
+    harmonics = torch.randn(mesh.num_vertices, 8, 3, dtype=torch.float64)
+    seen = Field(field.color, field.density, harmonics=harmonics)
+    camera = dtv.ParallelCamera.look_at((3.0, 2.0, 1.5), (0.5, 0.5, 0.5), extent=1.5, width=9, height=7)
+    rays, away = camera.rays(), 1e7
+    eye = rays.origins.mean((0, 1)) - away * rays.directions[0, 0]
+    far = Rays(eye, rays.origins + rays.directions - eye)
+    torch.testing.assert_close(render(mesh, seen, camera).color, render(mesh, seen, far).color, rtol=0.0, atol=1e-4)
 
 
 def test_rays_know_whether_they_start_at_one_point() -> None:

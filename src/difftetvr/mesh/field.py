@@ -146,7 +146,24 @@ class Field:
         places = mesh.vertices
         if self.location_on(mesh) == "cell":
             places = places[mesh.tets.long()].mean(1)
-        directions = torch.nn.functional.normalize(places - eye.to(places), dim=1)
+        return self._seen_along(torch.nn.functional.normalize(places - eye.to(places), dim=1))
+
+    def seen_along(self, direction: torch.Tensor) -> Field:
+        """The colours that parallel rays see, such as those of an orthographic camera.
+
+        Args:
+            direction: (3,) where the rays go, of any length but 0; differentiable.
+
+        Returns:
+            A field without harmonics; this one if it has none.
+        """
+        if self.harmonics is None:
+            return self
+        return self._seen_along(torch.nn.functional.normalize(direction[None].to(self.color.device), dim=1))
+
+    def _seen_along(self, directions: torch.Tensor) -> Field:
+        """The colours along (N, 3) unit vectors, or (1, 3) for all."""
+        assert self.harmonics is not None
         basis = harmonic_basis(directions, COUNTS.index(self.harmonics.shape[1])).to(self.color.dtype)
         color = self.color + (basis[:, :, None] * self.harmonics.to(self.color.dtype)).sum(1)
         return Field(color.clamp(min=0.0), self.density, self.location)

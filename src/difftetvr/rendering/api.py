@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, overload
 
@@ -17,12 +17,15 @@ from difftetvr.mesh import Field, TetMesh
 from difftetvr.optics import OpticalModel
 from difftetvr.rendering.autograd import RenderFunction
 from difftetvr.rendering.cell_features import CellFeatures
-from difftetvr.rendering.preparation import ViewOptions, prepare_view
+from difftetvr.rendering.preparation import ViewOptions, as_rays, is_plain, prepare_view
 from difftetvr.rendering.rays import Rays, RaySource
 from difftetvr.rendering.scalar_field import ScalarField
 
 _HALF, _OPAQUE = math.log(2.0), 1e3
 """Optical depths of opacity 1/2, and at which the transmittance is 0 in every precision."""
+
+_MOST_VIEWPOINTS = 1024
+"""Each has colours of all vertices of its own, which are kept for the backward pass."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +120,8 @@ def render(
         mesh: Tetrahedral mesh; its vertices' device and dtype (float32 or float64) decide where and how to render.
         field: Channels and density per vertex (linear inside each cell) or per cell (constant); or scalars likewise,
             with a transfer function; or channels per cell over the density of either (`CellFeatures`).
-        camera: A camera, inside or outside of the mesh; any bundle of rays; or cameras, which are rendered together.
+        camera: A camera, inside or outside of the mesh; any bundle of rays; or cameras, which are rendered together. A
+            field with harmonics is rendered once for each point where rays start, or direction if those are fewer.
         background: (C,) channels behind the volume, linear RGB for colours; 0 if None.
         renderer: How crossings are found and ordered. ``"marching"`` walks from cell to cell; ``"linked-list"`` sorts
             the crossings of each pixel; ``"projected"`` sorts the cells once for the whole view of a pinhole camera,
@@ -141,12 +145,17 @@ def render(
             rendered.
     """
     options = ViewOptions(optics, transmittance_threshold, deterministic, renderer)
-    one = lambda view: _render(mesh, field, view, background, options, clip_plane)  # noqa: E731
+    is_directional = getattr(field, "harmonics", None) is not None
+
+    def one(view: RaySource | Rays) -> RenderedImage:
+        look = lambda part: _render(mesh, field, part, background, options, clip_plane)  # noqa: E731
+        return _of_viewpoints(look, view) if is_directional else look(view)
+
     if not isinstance(camera, Sequence):
         return one(camera)
     cameras = checked_cameras(camera)
     # One after the other where each view has its own colours, or its own order of cells.
-    if renderer == "projected" or getattr(field, "harmonics", None) is not None:
+    if renderer == "projected" or is_directional:
         return _together([one(view) for view in cameras])
     bundles = [view.rays() for view in cameras]
     shapes = [tuple(bundle.shape) for bundle in bundles]
@@ -158,6 +167,33 @@ def render(
         parts.append(image[begin:end].reshaped(*shape))
         begin = end
     return tuple(parts)
+
+
+def _of_viewpoints(one: Callable[[RaySource | Rays], RenderedImage], camera: Any) -> RenderedImage:
+    """What a camera or rays see of colours that depend on the direction: apart for all points from where they look.
+
+    Raises:
+        DiffTetError: These are too many.
+    """
+    if is_plain(camera) or not isinstance(camera, (Rays, RaySource)) or isinstance(camera, type):
+        return one(camera)
+    rays = as_rays(camera)
+    if rays.eye is not None:
+        return one(rays)
+    parts = rays.by_viewpoint()
+    if len(parts) < 2:
+        return one(rays)
+    if len(parts) > _MOST_VIEWPOINTS:
+        raise DiffTetError(
+            f"The field's colours depend on the direction (harmonics), and the rays start at {len(parts):,} points and "
+            f"go in no fewer directions; pass rays from {_MOST_VIEWPOINTS:,} points at most, or a field without "
+            "harmonics."
+        )
+    images = [one(part) for _, part in parts]
+    place = torch.argsort(torch.cat([place for place, _ in parts])).to(images[0].alpha.device)
+    names = [field.name for field in fields(RenderedImage)]
+    joined = RenderedImage(*(torch.cat([getattr(image, name) for image in images]) for name in names))
+    return joined[place].reshaped(*rays.shape)
 
 
 def checked_cameras(cameras: Sequence[Any]) -> list[RaySource]:

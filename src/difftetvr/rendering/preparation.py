@@ -158,7 +158,7 @@ def prepare_view(
     """Check a view's inputs and bring them to kernels; arguments and errors are those of :func:`difftetvr.render`."""
     options = _checked(mesh, field, camera, options)
     require_own_threads()  # here already, since in a copy of a process torch may hang, too
-    source = camera.relative_to(mesh.origin) if _is_plain(camera) else as_rays(camera)
+    source = camera.relative_to(mesh.origin) if is_plain(camera) else as_rays(camera)
     content, parts = _content(mesh, field, source)
     for tensor in parts:
         if tensor.device != mesh.vertices.device:
@@ -262,7 +262,7 @@ def _checked(mesh: Any, field: Any, camera: Any, options: ViewOptions) -> ViewOp
         raise DiffTetError(f"optics is {shown(optics)}; pass a model, such as difftetvr.optics.ExactLinear().")
     if not isinstance(renderer, str) or renderer not in RENDERERS:
         raise DiffTetError(f"There is no renderer {shown(renderer)}; choose one of {', '.join(RENDERERS)}.")
-    if renderer == "projected" and not _is_plain(camera):
+    if renderer == "projected" and not is_plain(camera):
         raise DiffTetError(
             "The renderer 'projected' needs one order of cells for the whole view, and knows it for pinhole cameras "
             "alone, whose intrinsics require no gradient; choose marching or linked-list."
@@ -274,7 +274,7 @@ def _checked(mesh: Any, field: Any, camera: Any, options: ViewOptions) -> ViewOp
     return ViewOptions(optics, threshold, options.deterministic, renderer)
 
 
-def _is_plain(camera: RaySource | Rays) -> TypeGuard[Camera]:
+def is_plain(camera: RaySource | Rays) -> TypeGuard[Camera]:
     """Whether it is a camera that can be rasterised, and whose rays need no gradients but by the pose."""
     return type(camera) is Camera and camera.intrinsics is None
 
@@ -298,22 +298,32 @@ def _content(
         field = field.as_field()
     if field.harmonics is not None:
         field.validate(mesh)
-        field = field.seen_from(mesh, camera.position if isinstance(camera, Camera) else _eye(camera, mesh))
+        field = _seen(mesh, field, camera)
     return location, (field.color, field.density)
 
 
-def _eye(rays: Rays, mesh: TetMesh) -> torch.Tensor:
-    """(3,) the point that all rays start at, relative to the mesh's origin."""
-    rays = rays.relative_to(mesh.origin)
+def _seen(mesh: TetMesh, field: Field, camera: Camera | Rays) -> Field:
+    """A field whose colours depend on the direction, as a camera or rays that share a viewpoint see it."""
+    if isinstance(camera, Camera):
+        return field.seen_from(mesh, camera.position)
+    rays = camera.relative_to(mesh.origin)
     if (eye := rays.eye) is not None:
-        return eye
-    origins = rays.origins.reshape(-1, 3)
-    if not bool((origins.detach() == origins[:1].detach()).all()):
-        raise DiffTetError(
-            "The field's colours depend on the direction (harmonics), and are known for rays that start at one point; "
-            "render each camera by itself, or pass a field without harmonics."
-        )
-    return origins.mean(0) if len(origins) else mesh.vertices.new_zeros(3)
+        return field.seen_from(mesh, eye)
+    origins, directions = rays.origins.reshape(-1, 3), rays.directions.reshape(-1, 3)
+    if not len(origins):
+        return field.seen_from(mesh, mesh.vertices.new_zeros(3))
+    if _are_one(origins):
+        return field.seen_from(mesh, origins.mean(0))
+    if _are_one(directions):
+        return field.seen_along(directions.mean(0))
+    raise DiffTetError(
+        "The field's colours depend on the direction (harmonics), and are known here for rays that start at one point, "
+        "or go in one direction; ask for each camera by itself, or pass a field without harmonics."
+    )
+
+
+def _are_one(vectors: torch.Tensor) -> bool:
+    return bool((vectors.detach() == vectors[:1].detach()).all())
 
 
 def _camera_space(mesh: TetMesh, camera: Camera) -> torch.Tensor:

@@ -112,6 +112,22 @@ class Rays:
         eye = self.eye
         return self.origins if eye is None else eye
 
+    def by_viewpoint(self) -> list[tuple[torch.Tensor, Rays]]:
+        """The rays apart by what they share: a point where they start, or, of parallel ones, where they go.
+
+        They count as parallel where they have fewer directions than origins, value for value. Differentiable.
+
+        Returns:
+            (M,) places in this bundle, counted through all of its shape, and the (M,) rays there, for each.
+        """
+        origins, directions = self.origins.reshape(-1, 3), self.directions.reshape(-1, 3)
+        groups = [torch.unique(part.detach(), dim=0, return_inverse=True)[1] for part in (origins, directions)]
+        counts = [int(group.max()) + 1 if group.numel() else 0 for group in groups]
+        group, count = min(zip(groups, counts, strict=True), key=lambda pair: pair[1])
+        near, far = (end.reshape(-1) for end in self.ends)
+        all_places = torch.split(torch.argsort(group, stable=True), torch.bincount(group, minlength=count).tolist())
+        return [(place, Rays(origins[place], directions[place], near[place], far[place])) for place in all_places]
+
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Rays:
         """The same rays on another device or in another precision; autograd sees them as a function of these.
 
