@@ -8,9 +8,12 @@ from scipy.optimize import minimize
 
 import difftetvr as dtv
 from difftetvr.errors import DiffTetError, MeshError
+from difftetvr.fitting.refinement.gains import face_steps, flip_gains
 from difftetvr.mesh import Field, TetMesh, bisect_edges
+from difftetvr.mesh.changes.flip_search import find_flips
+from difftetvr.mesh.changes.flips import TWO_TO_THREE, apply_flips
 from difftetvr.rendering import Camera, LensCamera, render
-from difftetvr.rendering.gauss_newton import HatDerivatives, model_image
+from difftetvr.rendering.gauss_newton import HatDerivatives, model_image, model_line_integrals
 
 BACKGROUND = (0.3, 0.6, 0.1)
 OUTSIDE = {"eye": (0.4, -1.5, 0.9), "target": (0.5, 0.5, 0.5)}
@@ -252,3 +255,45 @@ def test_what_is_refused():
         model_image(mesh, per_cell, camera_at(OUTSIDE), truth)
     with pytest.raises(DiffTetError, match=r"shape \(48, 48, 3\); the camera takes \(30, 30, 3\)"):
         model_image(mesh, field, camera_at(OUTSIDE, size=30), truth)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e4])
+def test_models_of_line_integrals_predict_what_densities_do(scale):
+    """Of vertices exactly where rays meet their cells but once; of edges and flips as bent hats are integrated."""
+    mesh, field, _ = random_scene(scale=scale)
+    camera, generator = camera_at(OUTSIDE, scale=scale), torch.Generator().manual_seed(1)
+    density, unit = field.density, 4.0 / scale
+
+    def integrals(mesh, density):
+        return render(mesh, Field(density.new_zeros(len(density), 0), density), camera).optical_depth
+
+    measured = integrals(mesh, unit * torch.rand(len(density), generator=generator, dtype=torch.float64))
+    weights = torch.rand(measured.shape, generator=generator, dtype=torch.float64)
+
+    def loss(mesh, density):
+        return float((0.5 * weights * (integrals(mesh, density) - measured).square()).sum())
+
+    flips = find_flips(mesh)
+    values = torch.nn.functional.pad(density[:, None], (3, 0))
+    steps = face_steps(flips, values)[:, 3]
+    errors = weights * (integrals(mesh, density) - measured), weights
+    model = model_line_integrals(mesh, density, camera, errors, steps)
+    step = torch.tensor([[0.0, 0.0, 0.0, 0.3 * unit]], dtype=torch.float64)
+    before = loss(mesh, density)
+    for vertex in range(0, mesh.num_vertices, 7):
+        moved = density.clone()
+        moved[vertex] += step[0, 3]
+        decrease = float(model.vertices.decrease(step)[vertex])
+        assert before - loss(mesh, moved) == pytest.approx(decrease, rel=1e-3, abs=1e-6 * before)
+    for edge in range(0, mesh.topology.edges.shape[0], 23):
+        change = bisect_edges(mesh, torch.tensor([edge]))
+        moved = change.carry(density)
+        moved[change.is_new] += step[0, 3]
+        decrease = float(model.edges.decrease(step)[edge])
+        assert before - loss(change.mesh, moved) == pytest.approx(decrease, rel=0.03, abs=2e-3 * before)
+    gains = flip_gains(flips, values, model)
+    for one in (flips.kind == TWO_TO_THREE).nonzero().flatten()[:8]:
+        after = loss(apply_flips(flips.select(one[None])).mesh, density)
+        assert before - after == pytest.approx(float(gains[one]), rel=0.1, abs=2e-3 * before)
+    with pytest.raises(DiffTetError, match="shape"):
+        model_line_integrals(mesh, density, camera, (errors[0][1:], weights), steps)

@@ -14,8 +14,11 @@ from difftetvr.mesh import Field, TetMesh
 from difftetvr.rendering.api import as_background
 from difftetvr.rendering.kernels.composition import Composition
 from difftetvr.rendering.kernels.forward import render_forward
-from difftetvr.rendering.kernels.hats import RECORD, STEP_RECORD, HatImage, hat_records
-from difftetvr.rendering.preparation import ViewOptions, prepare_view
+from difftetvr.rendering.kernels.hats.absorption import RECORD as ABSORPTION_RECORD
+from difftetvr.rendering.kernels.hats.absorption import IntegralErrors, absorption_records
+from difftetvr.rendering.kernels.hats.kernel import STEP_RECORD, HatSpace
+from difftetvr.rendering.kernels.hats.light import RECORD, HatImage, hat_records
+from difftetvr.rendering.preparation import PreparedView, ViewOptions, prepare_view
 from difftetvr.rendering.rays import Rays, RaySource
 
 _TINY = 1e-30
@@ -288,8 +291,7 @@ def model_image(
         edges = backend.tensor(records.edges, -1, RECORD)[: mesh.topology.edges.shape[0]]
         faces = backend.tensor(records.faces, -1, RECORD if steps is None else STEP_RECORD)
         faces = faces[: mesh.topology.faces.shape[0]]
-    # Vertices were numbered in the order of memory.
-    vertices = torch.empty_like(rows).index_copy_(0, view.upload.order.vertices.long(), rows)
+    vertices = _in_order_of_mesh(rows, view)
     return ImageModel(
         _derivatives(vertices, curvature).with_density_unit(view.unit),
         _derivatives(edges, curvature).with_density_unit(view.unit),
@@ -297,6 +299,83 @@ def model_image(
         float(residual.square().mean()),
         None if steps is None else StepDerivatives(faces[:, 0], curvature * faces[:, 1]),
     )
+
+
+@eager
+@tried_twice
+@torch.no_grad()
+def model_line_integrals(
+    mesh: TetMesh,
+    density: torch.Tensor,
+    camera: RaySource | Rays,
+    errors: tuple[torch.Tensor, torch.Tensor],
+    face_steps: torch.Tensor,
+    deterministic: bool = False,
+) -> ImageModel:
+    """Predicts what changes of the mesh would do to a loss of its line integrals.
+
+    They are linear in densities, so of a squared error the models say all, but that hats of edges and faces are taken
+    in four pieces a crossing. Colours have no part in it: their derivatives are 0.
+
+    Args:
+        mesh: Mesh.
+        density: (V,) densities of its vertices, on its device.
+        camera: Camera of the view, or rays of any shape (...).
+        errors: (...) first and second derivatives of the loss by each line integral.
+        face_steps: (F,) the one step of density of each face's hat that is looked at, in the order of
+            ``mesh.topology.faces``. Steps of 0 cost nothing.
+        deterministic: Whether sums are the same in every run to the last bit, see :func:`difftetvr.render`.
+
+    Returns:
+        The model, in the precision and on the device of the mesh; its error is left at 0.
+
+    Raises:
+        MeshError: The densities do not fit the mesh, or are invalid.
+        DiffTetError: An argument has a wrong shape.
+        BackendError: No back end runs on the device of the mesh.
+    """
+    topology = mesh.topology
+    view = prepare_view(mesh, Field(density.new_zeros(len(density), 0), density, "vertex"), camera, ViewOptions())
+    wanted = [(view.shape, errors[0]), (view.shape, errors[1]), ((topology.faces.shape[0],), face_steps)]
+    for shape, tensor in wanted:
+        if tuple(tensor.shape) != tuple(shape):
+            raise DiffTetError(f"A derivative or step has shape {tuple(tensor.shape)}; this view takes {tuple(shape)}.")
+    backend = view.task.backend
+    tracer = view.tracer(view.limits(None))
+    with backend.exclusive(deterministic):
+        slopes, curvatures, steps = (
+            backend.floats(part.reshape(-1)) for part in (*errors, face_steps.to(mesh.vertices) * view.unit)
+        )
+        space = HatSpace.of(mesh, view.upload.order, [ABSORPTION_RECORD, ABSORPTION_RECORD, STEP_RECORD])
+        records = absorption_records(tracer, IntegralErrors(slopes, curvatures, steps), space, deterministic)
+        rows, edges, faces = (
+            backend.tensor(part, -1, 2)[:count]
+            for part, count in (
+                (records.vertices, mesh.num_vertices),
+                (records.edges, topology.edges.shape[0]),
+                (records.faces, topology.faces.shape[0]),
+            )
+        )
+    return ImageModel(
+        _of_density(_in_order_of_mesh(rows, view)).with_density_unit(view.unit),
+        _of_density(edges).with_density_unit(view.unit),
+        None,
+        0.0,
+        StepDerivatives(faces[:, 0], faces[:, 1]),
+    )
+
+
+def _in_order_of_mesh(rows: torch.Tensor, view: PreparedView) -> torch.Tensor:
+    """Records of vertices, which kernels number in the order of memory."""
+    return torch.empty_like(rows).index_copy_(0, view.upload.order.vertices.long(), rows)
+
+
+def _of_density(records: torch.Tensor) -> HatDerivatives:
+    """Models that know of nothing but density."""
+    zero = records.new_zeros(())
+    gradient = torch.nn.functional.pad(records[:, :1], (3, 0))
+    count = len(records)
+    return HatDerivatives(gradient, zero.expand(count), zero.expand(count, 3), records[:, 1], zero.expand(count))
 
 
 def _derivatives(records: torch.Tensor, curvature: float) -> HatDerivatives:

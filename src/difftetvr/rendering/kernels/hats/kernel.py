@@ -1,4 +1,4 @@
-"""What an image would gain if the mesh were finer or cut otherwise: derivatives by hat functions (Dr.Jit kernel).
+"""Rays through hat functions: what all that is gathered from their responses shares (Dr.Jit kernel).
 
 A hat function is 1 at a point, 0 on the boundary of the cells around it, and linear on the pieces in between:
 
@@ -6,10 +6,10 @@ A hat function is 1 at a point, 0 on the boundary of the cells around it, and li
     of an edge    what the values of a new vertex in its middle would multiply    2 min(lambda_i, lambda_j)
     of a face     what a flip of the face adds, with its peak in the centre       3 min(lambda_i, lambda_j, lambda_k)
 
-For each ray and each hat the kernel integrates the response of the pixel, B to one unit of colour and (D_r, D_g, D_b)
-to one unit of density. Its sums over rays give gradient and Gauss-Newton matrix of the squared error with respect to
-the hat's four coefficients. A ray crosses the cells around a vertex, edge or face one after the other, so responses are
-carried like vertices are: what a step drops is complete, and the square of the whole is added, not those of its parts.
+For each ray and each hat a kernel integrates the response of what is measured to the hat's coefficients. Its sums over
+rays give gradient and Gauss-Newton matrix of the squared error with respect to them. A ray crosses the cells around a
+vertex, edge or face one after the other, so responses are carried like vertices are: what a step drops is complete, and
+the square of the whole is added, not those of its parts.
 Only where a ray leaves cells that are not convex together and enters them again, the parts are squared for themselves;
 that underestimates the curvature of a few edges, in random Delaunay meshes by up to a fifth.
 """
@@ -24,7 +24,7 @@ import drjit as dr
 
 from difftetvr.mesh import TetMesh
 from difftetvr.recording import few_lengths, replayed
-from difftetvr.rendering.kernels.hat_tables import HatTables, RankedCell, ranks_of
+from difftetvr.rendering.kernels.hats.tables import HatTables, RankedCell, ranks_of
 from difftetvr.rendering.kernels.shares import Deal
 from difftetvr.rendering.search.memory_order import MemoryOrder
 from difftetvr.rendering.traversal.crossing import (
@@ -39,42 +39,24 @@ from difftetvr.rendering.traversal.rays import Lanes
 from difftetvr.rendering.traversal.sums import Copies, Sums
 from difftetvr.rendering.traversal.walk import Corner, Exit, Face
 
-RECORD = 12
-"""Floats a hat: colour gradient (3), density gradient, sums of B^2, B D (3), D^2, B, and two of padding."""
-
 STEP_RECORD = 2
 """Floats a step: derivative of the error, and sum of the squared responses."""
 
-_SAMPLES = 4
+SAMPLES = 4
 """Pieces of a crossing on which hats, colour and density are taken as constant."""
 
-_PLACES = [(k + 0.5) / _SAMPLES for k in range(_SAMPLES)]
+PLACES = [(k + 0.5) / SAMPLES for k in range(SAMPLES)]
 
 _UNKNOWN = 0xFFFFFFFF
 # A cell's corners in a kernel: the one that the walk drops, those that follow in the entry face's turn, and the apex.
 _DROPPED, _AFTER, _BEFORE, _APEX = range(4)
 
-Response = list[Any]  # B, D_r, D_g, D_b
-
-
-@dataclass
-class HatImage:
-    """What the kernel reads, flat.
-
-    Attributes:
-        color: (H, W, 3) radiance over the background.
-        gradient: (H, W, 3) derivative of the loss with respect to it.
-        face_steps: (F, 4) the one step that is looked at of each face; None for all.
-    """
-
-    color: Any
-    gradient: Any
-    face_steps: Any | None = None
+Response = list[Any]  # of light B, D_r, D_g, D_b
 
 
 @dataclass
 class HatRecords:
-    """Flat arrays of ``RECORD`` floats for each vertex, edge and face, or ``STEP_RECORD`` for each face."""
+    """Flat arrays of a record for each vertex, edge and face."""
 
     vertices: Any
     edges: Any
@@ -82,16 +64,16 @@ class HatRecords:
 
 
 @dataclass
-class _HatSums:
+class HatSums:
     """What the kernel adds to to make them."""
 
     vertices: Sums
     edges: Sums
     faces: Sums
 
-    def of_copy(self, copy: Any | None) -> _HatSums:
+    def of_copy(self, copy: Any | None) -> HatSums:
         """The same for lanes that each add to a copy of their own."""
-        return _HatSums(*(sums.of_copy(copy) for sums in (self.vertices, self.edges, self.faces)))
+        return HatSums(*(sums.of_copy(copy) for sums in (self.vertices, self.edges, self.faces)))
 
 
 @dataclass
@@ -129,33 +111,53 @@ class _Samples:
     def respond(self, *corners: int) -> Response:
         """Response of the hat over some corners."""
         total: Response = []
-        for x, response in zip(_PLACES, self.responses, strict=True):
+        for x, response in zip(PLACES, self.responses, strict=True):
             weights = [dr.fma(x, self.last[k] - self.first[k], self.first[k]) for k in corners]
             hat = functools.reduce(dr.fmin, weights) * float(len(corners))
             total = [dr.fma(hat, r, t) for r, t in zip(response, total)] or [hat * r for r in response]
         return total
 
 
-def hat_records(
-    tracer: Tracer, mesh: TetMesh, order: MemoryOrder, image: HatImage, in_order: bool = False
-) -> HatRecords:
-    """Sums over the rays of a view for every vertex, edge and face.
+@dataclass(frozen=True)
+class HatSpace:
+    """What there are hats of.
+
+    Attributes:
+        mesh: The mesh that is seen.
+        order: Its order in memory.
+        counts: Numbers of vertices, edges and faces that there is room for.
+        widths: Floats of a record of each.
+    """
+
+    mesh: TetMesh
+    order: MemoryOrder
+    counts: list[int]
+    widths: list[int]
+
+    @staticmethod
+    def of(mesh: TetMesh, order: MemoryOrder, widths: list[int]) -> HatSpace:
+        """All hats of a mesh; few different numbers, for kernels are compiled for them."""
+        counts = (mesh.num_vertices, mesh.topology.edges.shape[0], mesh.topology.faces.shape[0])
+        return HatSpace(mesh, order, [few_lengths(n) for n in counts], widths)
+
+
+def gathered_records(kernel: Any, tracer: Tracer, asked: Any, space: HatSpace, in_order: bool) -> HatRecords:
+    """Sums over the rays of a view.
 
     Args:
-        tracer: The view, to be walked through; its field lives on vertices.
-        mesh: The mesh that is seen.
-        order: Its order in memory, which is that of the records of vertices; edges and faces are in the mesh's.
-        image: The rendered image, and the derivative of the loss with respect to it.
-        in_order: Whether sums over rays have a certain order, see :mod:`difftetvr.rendering.kernels.shares`.
+        kernel: Class of a :class:`HatKernel`, made of tracer, rays, tables, sums and what is asked.
+        tracer: The view.
+        asked: What the kernel reads.
+        space: What there are hats of.
+        in_order: Whether sums over rays have a certain order.
     """
-    view, topology = tracer.view, mesh.topology
-    counts = [few_lengths(n) for n in (mesh.num_vertices, topology.edges.shape[0], topology.faces.shape[0])]
-    widths = [RECORD, RECORD, RECORD if image.face_steps is None else STEP_RECORD]
-    sizes = [count * width for count, width in zip(counts, widths, strict=True)]
-    deal, pairs = Deal.of(tracer, sum(sizes), in_order), zip(sizes, widths, strict=True)
+    view = tracer.view
+    sizes = [count * width for count, width in zip(space.counts, space.widths, strict=True)]
+    deal, pairs = Deal.of(tracer, sum(sizes), in_order), zip(sizes, space.widths, strict=True)
     buffers = _Buffers(sizes, [Copies.of(view.backend, deal.copies, size, width) for size, width in pairs])
+    tables = HatTables.of(view, space.mesh, space.order)
     with view.backend.on_threads(deal.threads):
-        records: HatRecords = replayed(_records, tracer, HatTables.of(view, mesh, order), image, deal, buffers)
+        records: HatRecords = replayed(_records, kernel, tracer, tables, asked, deal, buffers)
     return records
 
 
@@ -167,13 +169,13 @@ class _Buffers:
     copies: list[Copies | None]
 
 
-def _records(tracer: Tracer, tables: HatTables, image: HatImage, deal: Deal, buffers: _Buffers) -> HatRecords:
+def _records(kernel: Any, tracer: Tracer, tables: HatTables, asked: Any, deal: Deal, buffers: _Buffers) -> HatRecords:
     backend, pairs = tracer.view.backend, zip(buffers.sizes, buffers.copies, strict=True)
     parts = [Sums.zeros(backend, size, copies, deal.mode) for size, copies in pairs]
-    sums = _HatSums(*parts)
+    sums = HatSums(*parts)
 
     def run(part: Tracer, copy: Any | None) -> None:
-        part.trace(lambda rays: _HatKernel(part, rays, tables, sums.of_copy(copy), image))
+        part.trace(lambda rays: kernel(part, rays, tables, sums.of_copy(copy), asked))
 
     deal.trace(tracer, run)
     totals = HatRecords(*(part.total() for part in parts))
@@ -181,34 +183,67 @@ def _records(tracer: Tracer, tables: HatTables, image: HatImage, deal: Deal, buf
     return totals
 
 
-class _HatKernel:
-    """Gathers responses; see :class:`difftetvr.rendering.traversal.crossing.Kernel`."""
+class HatKernel:
+    """Gathers responses; see :class:`difftetvr.rendering.traversal.crossing.Kernel`.
 
-    def __init__(self, tracer: Tracer, rays: Lanes, tables: HatTables, records: _HatSums, image: HatImage) -> None:
+    What a response is, and what is kept of one, is up to what is looked for: :meth:`sample`, :meth:`record`,
+    :meth:`step_record`.
+    """
+
+    slots: int
+    """Numbers in a response."""
+    has_steps: bool
+    """Whether but one step of each face is looked at."""
+
+    def __init__(self, tracer: Tracer, rays: Lanes, tables: HatTables, records: HatSums) -> None:
         self.view, self.rays, self.tables, self.records = tracer.view, rays, tables, records
-        self.span, self.face_steps = Span.of(tracer, rays), image.face_steps
-        pixel, valid = rays.pixel, rays.valid
-        self.color, self.gradient = (
-            [dr.gather(self.view.backend.Float, array, 3 * pixel + k, valid) for k in range(3)]
-            for array in (image.color, image.gradient)
-        )
+        self.span = Span.of(tracer, rays)
+
+    def sample(self, entry: list[Any], leaving: list[Any], ray: HatRay) -> tuple[list[Response], Any, list[Any]]:
+        """Responses to a change at each piece of a crossing.
+
+        Args:
+            entry: Distance, density and channels where it begins.
+            leaving: The same where it ends.
+            ray: State of the rays.
+
+        Returns:
+            The responses, and transmittance and rest of the rays behind the crossing.
+        """
+        raise NotImplementedError
+
+    def record(self, response: Response) -> list[Any]:
+        """What is added to a hat's record."""
+        raise NotImplementedError
+
+    def step_record(self, face: Any, response: Response) -> tuple[list[Any], Any]:
+        """What is added to the record of a face's one step, and where it is asked for."""
+        raise NotImplementedError
 
     def start(self) -> HatRay:
+        """State of the rays before their first crossing."""
         lanes = dr.width(self.rays.pixel)
         return HatRay(
             dr.ones(self.view.backend.Float, lanes),
-            self.color,
+            self.light(),
             [self._no_response() for _ in range(3)],
             [dr.full(self.view.backend.UInt, _UNKNOWN, lanes) for _ in range(3)],
             self._no_response(),
         )
 
+    def light(self) -> list[Any]:
+        """Radiance of the whole rays; nothing where it does not matter."""
+        return []
+
     def read(self, vertex: Any, active: Any) -> Corner:
+        """A vertex with its values."""
         position, attributes = read_vertex(self.view, vertex, active)
-        attributes = [*attributes, *read_channels(self.view, vertex, active)]
-        return corner_of(self.rays.frame, vertex, position, attributes, 4)
+        if self.view.has_vertex_channels:
+            attributes = [*attributes, *read_channels(self.view, vertex, active)]
+        return corner_of(self.rays.frame, vertex, position, attributes, self.slots)
 
     def visit(self, step: Step, ray: HatRay) -> HatRay:
+        """Add a crossing's responses, and scatter those of hats that the ray leaves behind."""
         samples, transmittance, rest = self._sample(step, ray)
         self._finish_vertices(step, samples)
         vertices = [*_turned(step.exit, [corner.vertex for corner in step.face.corners]), step.apex.vertex]
@@ -217,9 +252,11 @@ class _HatKernel:
         return HatRay(transmittance, rest, edges, edge_ids, self._finish_faces(ray, samples, cell))
 
     def goes_on(self, ray: HatRay) -> Any:
+        """Whether a ray has something to gather from the cells that are still ahead of it."""
         return ray.transmittance > self.view.threshold
 
     def leave(self, face: Face, ray: HatRay, active: Any) -> HatRay:
+        """Scatter what is carried at a face behind which there is no cell."""
         for corner in face.corners:
             self._scatter(self.records.vertices, corner.vertex, corner.adjoints, active)
         for edge, response in zip(ray.edge_ids, ray.edges, strict=True):
@@ -239,25 +276,8 @@ class _HatKernel:
             clip = self.span.clip(entry[0], leaving[0])
             first, last = clip.start(first, last), clip.end(first, last)
             entry, leaving = clip.start(entry, leaving), clip.end(entry, leaving)
-        length = dr.fmax(leaving[0] - entry[0], 0.0)
-        piece = length * (1.0 / _SAMPLES)
-        transmittance, rest = ray.transmittance, ray.rest
-        responses = []
-        for x in _PLACES:
-            density, *color = (dr.fma(x, v1 - v0, v0) for v0, v1 in zip(entry[1:], leaving[1:], strict=True))
-            opacity = 1.0 - dr.exp(-density * piece)
-            seen = transmittance * opacity
-            transmittance = transmittance - seen
-            rest = [dr.fma(-seen, c, r) for c, r in zip(color, rest, strict=True)]
-            # More density here shows more of this piece and dims all that lies behind it.
-            dims = [piece * dr.fma(transmittance, c, -r) for c, r in zip(color, rest, strict=True)]
-            responses.append([seen, *dims])
-        # The state goes on exactly: errors of the pieces do not add up along the ray.
-        w0, w1, through = self.view.optics.weights(length, entry[1], leaving[1])
-        w0, w1 = w0 * ray.transmittance, w1 * ray.transmittance
-        colors = zip(entry[2:], leaving[2:], ray.rest, strict=True)
-        behind = [r - dr.fma(w0, c0, w1 * c1) for c0, c1, r in colors]
-        return _Samples(responses, first, last), ray.transmittance * through, behind
+        responses, transmittance, rest = self.sample(entry, leaving, ray)
+        return _Samples(responses, first, last), transmittance, rest
 
     def _finish_vertices(self, step: Step, samples: _Samples) -> None:
         """Scatter the dropped corner; the others go on to the next face."""
@@ -294,29 +314,18 @@ class _HatKernel:
         return samples.respond(_AFTER, _BEFORE, _APEX)
 
     def _scatter_face(self, face: Any, response: Response) -> None:
-        if self.face_steps is None:
+        if not self.has_steps:
             self._scatter(self.records.faces, face, response, True)
             return
-        *color, density = dr.gather(self.view.backend.Float4, self.face_steps, face)
-        changes = [dr.fma(response[0], c, d * density) for c, d in zip(color, response[1:], strict=True)]
-        slope, square = (
-            dr.fma(one[0], changes[0], dr.fma(one[1], changes[1], one[2] * changes[2]))
-            for one in (self.gradient, changes)
-        )
-        is_asked = (density != 0) | (color[0] != 0) | (color[1] != 0) | (color[2] != 0)
-        self.records.faces.add(self.view.backend.Floats([slope, square]), face, is_asked)
+        record, is_asked = self.step_record(face, response)
+        self.records.faces.add(self.view.backend.Floats(record), face, is_asked)
 
     def _scatter(self, sums: Sums, index: Any, response: Response, active: Any) -> None:
-        b, d, g = response[0], response[1:], self.gradient
-        zero = dr.zeros_like(b)
-        slope = dr.fma(g[0], d[0], dr.fma(g[1], d[1], g[2] * d[2]))
-        square = dr.fma(d[0], d[0], dr.fma(d[1], d[1], d[2] * d[2]))
-        record = [g[0] * b, g[1] * b, g[2] * b, slope, b * b, *(b * v for v in d), square, b, zero, zero]
         # In one piece: on GPUs, threads of a warp that share a record have to find each other but once.
-        sums.add(self.view.backend.Floats(record), index, active)
+        sums.add(self.view.backend.Floats(self.record(response)), index, active)
 
     def _no_response(self) -> Response:
-        return [dr.zeros(self.view.backend.Float, dr.width(self.rays.pixel)) for _ in range(4)]
+        return [dr.zeros(self.view.backend.Float, dr.width(self.rays.pixel)) for _ in range(self.slots)]
 
 
 def _barycentric(step: Step) -> tuple[list[Any], list[Any]]:

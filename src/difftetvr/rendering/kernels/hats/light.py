@@ -1,0 +1,117 @@
+"""Derivatives of an image's squared error by hat functions (Dr.Jit kernel).
+
+A pixel responds with B to one unit of a hat's colour and with (D_r, D_g, D_b) to one unit of its density.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+from difftetvr.mesh import TetMesh
+from difftetvr.rendering.kernels.hats.kernel import (
+    PLACES,
+    SAMPLES,
+    STEP_RECORD,
+    HatKernel,
+    HatRay,
+    HatRecords,
+    HatSpace,
+    HatSums,
+    Response,
+    gathered_records,
+)
+from difftetvr.rendering.kernels.hats.tables import HatTables
+from difftetvr.rendering.search.memory_order import MemoryOrder
+from difftetvr.rendering.traversal.crossing import Tracer
+from difftetvr.rendering.traversal.rays import Lanes
+
+RECORD = 12
+"""Floats a hat: colour gradient (3), density gradient, sums of B^2, B D (3), D^2, B, and two of padding."""
+
+
+@dataclass
+class HatImage:
+    """What the kernel reads, flat.
+
+    Attributes:
+        color: (H, W, 3) radiance over the background.
+        gradient: (H, W, 3) derivative of the loss with respect to it.
+        face_steps: (F, 4) the one step that is looked at of each face; None for all.
+    """
+
+    color: Any
+    gradient: Any
+    face_steps: Any | None = None
+
+
+def hat_records(
+    tracer: Tracer, mesh: TetMesh, order: MemoryOrder, image: HatImage, in_order: bool = False
+) -> HatRecords:
+    """Sums over the rays of a view for every vertex, edge and face.
+
+    Args:
+        tracer: The view, to be walked through; its field lives on vertices.
+        mesh: The mesh that is seen.
+        order: Its order in memory, which is that of the records of vertices; edges and faces are in the mesh's.
+        image: The rendered image, and the derivative of the loss with respect to it.
+        in_order: Whether sums over rays have a certain order, see :mod:`difftetvr.rendering.kernels.shares`.
+    """
+    widths = [RECORD, RECORD, RECORD if image.face_steps is None else STEP_RECORD]
+    return gathered_records(_LightHats, tracer, image, HatSpace.of(mesh, order, widths), in_order)
+
+
+class _LightHats(HatKernel):
+    """Responses of radiance: B to one unit of colour, and (D_r, D_g, D_b) to one unit of density."""
+
+    slots = 4
+
+    def __init__(self, tracer: Tracer, rays: Lanes, tables: HatTables, records: HatSums, image: HatImage) -> None:
+        super().__init__(tracer, rays, tables, records)
+        self.face_steps, self.has_steps = image.face_steps, image.face_steps is not None
+        self.color, self.gradient = (
+            [dr.gather(self.view.backend.Float, array, 3 * rays.pixel + k, rays.valid) for k in range(3)]
+            for array in (image.color, image.gradient)
+        )
+
+    def light(self) -> list[Any]:
+        return self.color
+
+    def sample(self, entry: list[Any], leaving: list[Any], ray: HatRay) -> tuple[list[Response], Any, list[Any]]:
+        length = dr.fmax(leaving[0] - entry[0], 0.0)
+        piece = length * (1.0 / SAMPLES)
+        transmittance, rest = ray.transmittance, ray.rest
+        responses = []
+        for x in PLACES:
+            density, *color = (dr.fma(x, v1 - v0, v0) for v0, v1 in zip(entry[1:], leaving[1:], strict=True))
+            opacity = 1.0 - dr.exp(-density * piece)
+            seen = transmittance * opacity
+            transmittance = transmittance - seen
+            rest = [dr.fma(-seen, c, r) for c, r in zip(color, rest, strict=True)]
+            # More density here shows more of this piece and dims all that lies behind it.
+            dims = [piece * dr.fma(transmittance, c, -r) for c, r in zip(color, rest, strict=True)]
+            responses.append([seen, *dims])
+        # The state goes on exactly: errors of the pieces do not add up along the ray.
+        w0, w1, through = self.view.optics.weights(length, entry[1], leaving[1])
+        w0, w1 = w0 * ray.transmittance, w1 * ray.transmittance
+        colors = zip(entry[2:], leaving[2:], ray.rest, strict=True)
+        behind = [r - dr.fma(w0, c0, w1 * c1) for c0, c1, r in colors]
+        return responses, ray.transmittance * through, behind
+
+    def record(self, response: Response) -> list[Any]:
+        b, d, g = response[0], response[1:], self.gradient
+        zero = dr.zeros_like(b)
+        slope = dr.fma(g[0], d[0], dr.fma(g[1], d[1], g[2] * d[2]))
+        square = dr.fma(d[0], d[0], dr.fma(d[1], d[1], d[2] * d[2]))
+        return [g[0] * b, g[1] * b, g[2] * b, slope, b * b, *(b * v for v in d), square, b, zero, zero]
+
+    def step_record(self, face: Any, response: Response) -> tuple[list[Any], Any]:
+        *color, density = dr.gather(self.view.backend.Float4, self.face_steps, face)
+        changes = [dr.fma(response[0], c, d * density) for c, d in zip(color, response[1:], strict=True)]
+        slope, square = (
+            dr.fma(one[0], changes[0], dr.fma(one[1], changes[1], one[2] * changes[2]))
+            for one in (self.gradient, changes)
+        )
+        return [slope, square], (density != 0) | (color[0] != 0) | (color[1] != 0) | (color[2] != 0)
