@@ -61,6 +61,46 @@ class PlainFile:
         """
         return self._array(inside, part, _MOST_LINKS)
 
+    def holds(self, inside: str) -> bool:
+        """Whether there is something at a path in the file; it need not be an array of numbers."""
+        try:
+            return inside in self._file
+        # As in `_sentences`.
+        except Exception:
+            return False
+
+    def text(self, inside: str) -> str:
+        """One text. HDF5 packs none, so it is no longer than the file.
+
+        Args:
+            inside: Its path in the file.
+
+        Raises:
+            MeshError: There is none, it lies elsewhere, or is damaged.
+        """
+        with _sentences(self.path):
+            link = self._file.get(inside, getlink=True)
+            found = self._file[inside] if isinstance(link, self._h5py.HardLink) else None
+            is_text = isinstance(found, self._h5py.Dataset) and self._h5py.check_string_dtype(found.dtype) is not None
+            if found is None or not is_text or found.size != 1 or found.external or found.is_virtual:
+                raise damaged(self.path, f"{inside[:80]!r} in it is no text")
+            self._require_modest(found.dtype.itemsize)
+            value = found[()]
+            return value.decode() if isinstance(value, bytes) else str(value)
+
+    def unit_of(self, inside: str) -> str:
+        """What an array's attribute ``units`` says; empty where there is none, or no text."""
+        with contextlib.suppress(Exception):  # as in `_sentences`
+            value = self._file[inside].attrs["units"]
+            return value.decode() if isinstance(value, bytes) else value if isinstance(value, str) else ""
+        return ""
+
+    def shape_of(self, inside: str) -> tuple[int, ...]:
+        """How many numbers an array has along its axes; none where there is no array."""
+        with _sentences(self.path):
+            found = self._file.get(inside) if self.holds(inside) else None
+            return tuple(found.shape) if isinstance(found, self._h5py.Dataset) and found.shape else ()
+
     def require_plain(self, sized: bool = True) -> None:
         """Checks all that is in the file, for readers that are less careful.
 
