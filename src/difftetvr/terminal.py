@@ -8,6 +8,7 @@ import os
 import re
 import sys
 import threading
+import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, Literal, TextIO
@@ -16,7 +17,7 @@ from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
 from rich.text import Text
 
-from difftetvr.errors import DiffTetError
+from difftetvr.errors import DiffTetError, counted
 from difftetvr.memory import is_out_of_memory
 
 _LONG_SECONDS = 3.0
@@ -162,6 +163,39 @@ def waiting(console: Console, text: str) -> Iterator[None]:
         yield
     finally:
         line.cancel()
+
+
+@contextlib.contextmanager
+def counting(console: Console, text: str, noun: str) -> Iterator[Callable[[int, int], None]]:
+    """Says how far something has come that takes its time.
+
+    On a terminal a bar grows beside the text; elsewhere a line says it every few seconds.
+
+    Args:
+        console: Where to show it.
+        text: What is going on, shown as it is.
+        noun: What is counted.
+
+    Yields:
+        A function of the number that is done, and of all.
+    """
+    due = time.monotonic() + _LONG_SECONDS
+
+    def say(done: int, total: int) -> None:
+        nonlocal due
+        if time.monotonic() >= due and done < total:
+            due = time.monotonic() + _LONG_SECONDS
+            console.print(f"{text}: {done:,} of {counted(total, noun)} ...", highlight=False)
+
+    if not console.is_terminal:
+        yield say
+        return
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn  # late: most commands show none
+
+    shown = TextColumn("{task.description}", markup=False)
+    with Progress(shown, BarColumn(), MofNCompleteColumn(), console=console, transient=True) as bar:
+        task = bar.add_task(printable(text), total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
 def sentence_for(error: Exception) -> str | None:

@@ -7,6 +7,7 @@ from . import loading as loading
 from . import orbit as orbit
 from . import packed as packed
 from . import photos as photos
+from . import projections as projections
 from . import viewing as viewing
 from . import volumes as volumes
 from .capture import Capture as Capture
@@ -18,25 +19,39 @@ from .packed import PackedImages as PackedImages
 from .photos.photo_capture import PhotoCapture as PhotoCapture
 from .photos.photo_capture import is_photo_source as is_photo_source
 from .photos.photo_set import CaptureWarning as CaptureWarning
+from .projections.geometry import ProjectionGeometry as ProjectionGeometry
+from .projections.noise import Noise as Noise
+from .projections.projection_capture import ProjectionCapture as ProjectionCapture
+from .projections.projector import project_volume as project_volume
+from .projections.readers.table import is_projection_source as is_projection_source
 from .volumes.volume import Volume as Volume
 from .volumes.volume import is_volume_file as is_volume_file
 from .volumes.volume_capture import TOOTH as TOOTH
 from .volumes.volume_capture import VolumeCapture as VolumeCapture
 from .volumes.volume_renderer import VolumeRenderer as VolumeRenderer
+from .volumes.voxels import VoxelVolume as VoxelVolume
+from .volumes.voxels import load_volume as load_volume
 
 __all__ = [
     "TOOTH",
     "Capture",
     "CaptureWarning",
     "MixedImages",
+    "Noise",
     "PackedImages",
     "PhotoCapture",
+    "ProjectionCapture",
+    "ProjectionGeometry",
     "Volume",
     "VolumeCapture",
     "VolumeRenderer",
+    "VoxelVolume",
     "fibonacci_orbit",
     "is_photo_source",
+    "is_projection_source",
     "is_volume_file",
     "load_capture",
+    "load_volume",
+    "project_volume",
     "random_orbit",
 ]

@@ -1,4 +1,4 @@
-"""The command line: ``difftetvr fit | mesh | render | compare | cut | eval | info | export | doctor``.
+"""The command line: ``difftetvr fit | mesh | render | compare | cut | eval | info | export | ...``, see `COMMANDS`.
 
 PyTorch takes seconds to import, so only a command that runs does it: help, versions and mistyped arguments do not. All
 else that takes its time is imported by `main`, not with this module: only there does an interrupt end in good order.
@@ -36,6 +36,8 @@ COMMANDS = {
     "eval": "files.Eval",
     "info": "files.Info",
     "export": "export.command.Export",
+    "project": "project.Project",
+    "voxelise": "export.voxelise.Voxelise",
     "doctor": "doctor.Doctor",
 }
 """Modules and dataclasses of the commands, within this package."""

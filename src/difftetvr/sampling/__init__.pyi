@@ -4,6 +4,7 @@ from . import grids as grids
 from . import interpolation as interpolation
 from . import isosurfaces as isosurfaces
 from . import location as location
+from . import nifti as nifti
 from . import probing as probing
 from . import slabs as slabs
 from . import surface_files as surface_files

@@ -1,4 +1,4 @@
-"""Values on regular grids in files: NRRD, VTK's image data and NumPy's arrays.
+"""Values on regular grids in files: NRRD, VTK's image data, NIfTI and NumPy's arrays.
 
 Files are written slab by slab, x fastest, so a grid that is sampled on its way into one need not fit into memory.
 
@@ -23,6 +23,7 @@ from difftetvr.files import atomic_write, require_room
 from difftetvr.inputs import as_reals, require_type
 from difftetvr.mesh.io.formats.data import xml_problem
 from difftetvr.sampling.grids import Grid
+from difftetvr.sampling.nifti import nifti_header
 from difftetvr.sampling.voxels import AT_ONCE
 from difftetvr.vtk_xml import TYPES
 
@@ -66,6 +67,8 @@ def save_grid(
       fastest axis.
     - ``.vti``: any number of arrays as point data, so that points of the image are points of the grid; not packed. VTK
       before 9.0 passes over directions.
+    - ``.nii``: one array, NIfTI 1, not packed, in the patient's axes where the grid's space tells them, else in the
+      world's as they are; components of vectors are the fifth axis.
     - ``.npy``: one array of shape (Z, Y, X) or (Z, Y, X, C), and nothing about the grid.
 
     The file appears whole or not at all. `voxelise_to_file` samples a mesh on the way into a file.
@@ -103,8 +106,23 @@ def save_grid(
     write_grid(path, arrays, grid, slabs(), remark)
 
 
-def write_grid(path: str | Path, arrays: Sequence[ArrayOfGrid], grid: Grid, slabs: Iterable[Slab], remark: str) -> None:
+def write_grid(
+    path: str | Path,
+    arrays: Sequence[ArrayOfGrid],
+    grid: Grid,
+    slabs: Iterable[Slab],
+    remark: str,
+    x_first: bool = False,
+) -> None:
     """Writes arrays of which some layers along z are there at a time; see `save_grid`.
+
+    Args:
+        path: The file.
+        arrays: What it holds.
+        grid: Where the values are.
+        slabs: The values, layer by layer.
+        remark: What else to say in a header.
+        x_first: Whether the axes of a ``.npy`` are x, y, z, instead of z, y, x; its bytes are the same.
 
     Raises:
         MeshError: As `save_grid`.
@@ -113,7 +131,9 @@ def write_grid(path: str | Path, arrays: Sequence[ArrayOfGrid], grid: Grid, slab
     if not str(path).lower().endswith(".nrrd"):  # of what is packed, the size is not known
         require_room(path, grid.num_points * sum(array.bytes_of_point for array in arrays), MeshError)
     with atomic_write(path, MeshError) as temporary, temporary.open("wb") as file:
-        _FORMATS[Path(path).suffix.lower()](file, arrays, grid, slabs, remark)
+        suffix = Path(path).suffix.lower()
+        write = _write_npy_x_first if x_first and suffix == ".npy" else _FORMATS[suffix]
+        write(file, arrays, grid, slabs, remark)
 
 
 def require_grid_format(path: str | Path, names: Sequence[str]) -> None:
@@ -247,10 +267,38 @@ def _data_array(array: ArrayOfGrid, offset: int) -> str:
 def _write_npy(file: BinaryIO, arrays: Sequence[ArrayOfGrid], grid: Grid, slabs: Iterable[Slab], remark: str) -> None:
     (array,) = arrays
     shape = (*grid.shape[::-1], *([] if array.components is None else [array.components]))
-    header = {"descr": array.dtype.newbyteorder("<").str, "fortran_order": False, "shape": shape}
+    _write_npy_of(file, array, shape, False, slabs)
+
+
+def _write_npy_x_first(
+    file: BinaryIO, arrays: Sequence[ArrayOfGrid], grid: Grid, slabs: Iterable[Slab], remark: str
+) -> None:
+    (array,) = arrays
+    shape = (*([] if array.components is None else [array.components]), *grid.shape)
+    _write_npy_of(file, array, shape, True, slabs)
+
+
+def _write_npy_of(
+    file: BinaryIO, array: ArrayOfGrid, shape: tuple[int, ...], first_is_fastest: bool, slabs: Iterable[Slab]
+) -> None:
+    header = {"descr": array.dtype.newbyteorder("<").str, "fortran_order": first_is_fastest, "shape": shape}
     np.lib.format.write_array_header_1_0(file, header)
     for (values,) in slabs:
         file.write(_little_endian(values))
+
+
+def _write_nii(file: BinaryIO, arrays: Sequence[ArrayOfGrid], grid: Grid, slabs: Iterable[Slab], remark: str) -> None:
+    (array,) = arrays
+    header = nifti_header(grid, array.dtype, array.components, array.name, remark)
+    file.write(header)
+    size = array.dtype.itemsize * grid.num_points
+    done = 0
+    for (values,) in slabs:
+        # Components are the slowest axis: a part of the file for each.
+        for index in range(array.components or 1):
+            file.seek(len(header) + index * size + done)
+            file.write(_little_endian(values if array.components is None else values[..., index]))
+        done += values[..., 0].nbytes if array.components else values.nbytes
 
 
 def _little_endian(values: np.ndarray) -> memoryview:
@@ -282,6 +330,7 @@ def _quoted(unit: str) -> str:
 _FORMATS: dict[str, Callable[[BinaryIO, Sequence[ArrayOfGrid], Grid, Iterable[Slab], str], None]] = {
     ".nrrd": _write_nrrd,
     ".vti": _write_vti,
+    ".nii": _write_nii,
     ".npy": _write_npy,
 }
 GRID_SUFFIXES = tuple(_FORMATS)

@@ -76,7 +76,7 @@ def voxelise_to_file(
     """Writes what `voxelise` finds on a grid, without holding more than a few of its layers at a time.
 
     Args:
-        path: The file, .nrrd, .vti or .npy, as `save_grid` writes it.
+        path: The file, .nrrd, .vti, .nii or .npy, as `save_grid` writes it.
         mesh: The mesh; loose cells and holes may be.
         values: (V, ...) per vertex or (T, ...) per cell; in a .vti, several of them by name. One alone is called
             "values".
@@ -101,6 +101,7 @@ def write_sampled(
     grid: Grid,
     sampling: Sampling,
     written_as: Grid | None = None,
+    x_first: bool = False,
 ) -> None:
     """Writes what a grid has of values, each on a mesh of its own; see `voxelise_to_file`.
 
@@ -111,6 +112,7 @@ def write_sampled(
         sampling: How.
         written_as: The grid that the file tells, of the same shape, where the meshes are not in its world; None: the
             one that is sampled.
+        x_first: Whether the axes of a ``.npy`` are x, y, z, instead of z, y, x.
 
     Raises:
         MeshError: As `voxelise_to_file`.
@@ -127,7 +129,7 @@ def write_sampled(
             found = {name: values for group in groups for name, values in group.layers(first, count, sampling).items()}
             yield [found[name] for name in arrays]
 
-    write_grid(path, [kinds[name] for name in arrays], written_as or grid, slabs(), sampling.remark())
+    write_grid(path, [kinds[name] for name in arrays], written_as or grid, slabs(), sampling.remark(), x_first)
 
 
 @dataclass(frozen=True, eq=False)

@@ -115,13 +115,13 @@ def _turning(entries: Entries, kind: str) -> Circular:
     width, height = int(counts[0]), int(counts[1]) if len(counts) == 2 else 1
     pixel = np.array([size[0] / width, size[1] / height if len(size) == 2 else size[0] / width])
     tilt = entries.numbers("tilt", (1, 3), (0.0,))
-    distances: dict[str, float] = {}
+    distances: dict[str, Any] = {}
     if kind != "parallel":
         source, detector = (entries.number(name, positive=True) for name in _DISTANCES)
         if not detector > source:
             raise CaptureError(
-                f"{entries.source} has its detector {detector:g} from the source and the axis {source:g}, so that it is "
-                "not behind the axis; detector_distance is that from source to detector, and greater."
+                f"{entries.source} has its detector {detector:g} from the source and the axis {source:g}, so that it "
+                "is not behind the axis; detector_distance is that from source to detector, and greater."
             )
         distances = {"source_distance": source, "detector_distance": detector}
     offset = entries.numbers("detector_offset", (1, 2), (0.0, 0.0))
@@ -174,7 +174,9 @@ def _free(entries: Entries) -> tuple[Detector, Floats | None]:
     return Detector(width=int(counts[0]), height=int(counts[1]), **tensors), angles
 
 
-def described(detector: Detector, bounds: torch.Tensor, unit: str | None, angles: torch.Tensor | None) -> dict[str, Any]:
+def described(
+    detector: Detector, bounds: torch.Tensor, unit: str | None, angles: torch.Tensor | None
+) -> dict[str, Any]:
     """The description that `parse_described` makes the same of, to the last bit: that of free views."""
     names = [name for name in _VIEW if getattr(detector, name) is not None]
     tables = {name: getattr(detector, name).detach().cpu().double().tolist() for name in names}

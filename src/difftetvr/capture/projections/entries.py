@@ -7,7 +7,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -111,7 +111,9 @@ class Entries:
         if not is_fit or numbers is None:
             sort = "numbers greater than 0" if positive else "finite numbers"
             many = " or ".join(map(str, counts)) if counts else "a list of"
-            self.refuse(name, f"give {many} {sort}" if counts != (1,) else f"give a {sort.replace('numbers', 'number')}")
+            self.refuse(
+                name, f"give {many} {sort}" if counts != (1,) else f"give a {sort.replace('numbers', 'number')}"
+            )
         return numbers
 
     def rows(self, name: str, width: int) -> NDArray[np.float64]:
@@ -135,7 +137,7 @@ class Entries:
             raise CaptureError(f"{self.source} lacks the entry '{name}'; add it.")
         return self.values[name]
 
-    def refuse(self, name: str, advice: str) -> Any:
+    def refuse(self, name: str, advice: str) -> NoReturn:
         """Says what is wrong with an entry.
 
         Raises:

@@ -51,7 +51,9 @@ class ProjectionGeometry:
         bounds = bounds.to("cpu", torch.float64)
         is_box = bounds.shape == (2, 3) and bool(torch.isfinite(bounds).all() and (bounds[0] < bounds[1]).all())
         if not is_box:
-            raise CaptureError(f"bounds is {shown(self.bounds)}; pass a lower and, greater in all axes, an upper corner.")
+            raise CaptureError(
+                f"bounds is {shown(self.bounds)}; pass a lower and, greater in all axes, an upper corner."
+            )
         object.__setattr__(self, "bounds", bounds)
         object.__setattr__(self, "detector", _expanded(self.detector))
         require_sight(self.detector, bounds)
@@ -104,7 +106,7 @@ class ProjectionGeometry:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """The geometry as numbers, lists and texts of JSON, each view by its vectors; `from_dict` reads back the same."""
+        """The geometry as JSON has it, each view by its vectors; `from_dict` reads back the same, to the last bit."""
         return described(self.detector, self.bounds, self.unit, self.angles)
 
     @staticmethod
@@ -178,5 +180,6 @@ def _expanded(detector: Detector) -> Detector:
 
 
 def _with_vectors(detector: Detector, change: Any) -> Detector:
-    vectors = {name: getattr(detector, name) for name in _VECTORS}
-    return dataclasses.replace(detector, **{n: None if v is None else change(v) for n, v in vectors.items()})
+    vectors: dict[str, Any] = {name: getattr(detector, name) for name in _VECTORS}
+    changed: dict[str, Any] = {name: None if vector is None else change(vector) for name, vector in vectors.items()}
+    return dataclasses.replace(detector, **changed)

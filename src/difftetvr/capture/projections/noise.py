@@ -15,7 +15,9 @@ from difftetvr.errors import CaptureError, shown
 _LEAST_COUNT = 0.5  # where noise leaves none, as between none and one photon
 _AT_ONCE = 2**22
 _MOST_COUNTS = 1e15
-_WORDS = "give it as 'poisson:1e4,gaussian:10', with 'scale:1' behind it for counts that do not depend on the largest one"
+_WORDS = (
+    "give it as 'poisson:1e4,gaussian:10', with 'scale:1' behind it for counts that do not depend on the largest one"
+)
 
 
 @dataclass(frozen=True)
@@ -71,6 +73,16 @@ class Noise:
                 raise CaptureError(f"The noise is {shown(text)}; {_WORDS}.") from None
         return Noise(**found)
 
+    @staticmethod
+    def require_seed(seed: int) -> None:
+        """Checks that random numbers can begin with a seed.
+
+        Raises:
+            CaptureError: It is no whole number of at least 0.
+        """
+        if not isinstance(seed, int) or seed < 0:
+            raise CaptureError(f"The seed is {shown(seed)}; give a whole number of at least 0.")
+
     def apply(self, line_integrals: torch.Tensor, seed: int = 0) -> NoisyProjections:
         """Noisy line integrals of the same shape, their variances, and where counts were left.
 
@@ -81,8 +93,7 @@ class Noise:
         Raises:
             CaptureError: Without a scale, nothing absorbs; or the seed is negative.
         """
-        if not isinstance(seed, int) or seed < 0:
-            raise CaptureError(f"The seed is {shown(seed)}; give a whole number of at least 0.")
+        self.require_seed(seed)
         clean = line_integrals.detach().cpu().numpy()
         noisy, variance = np.array(clean, dtype=np.float32), np.zeros(clean.shape, dtype=np.float32)
         valid = np.ones(clean.shape, dtype=bool)

@@ -29,7 +29,7 @@ class ProjectionCapture:
         geometry: Where source and detector were, the box to reconstruct, and the unit of length.
         line_integrals: (V, H, W) float32, integrals of the attenuation along the rays to the pixels: numbers without a
             unit, so that attenuation is per unit of the geometry. Noise may make them negative.
-        variance: (V, H, W) float32 > 0 of the line integrals by the model of their noise, or None where it is not known.
+        variance: (V, H, W) float32 > 0 of the line integrals by the model of their noise; None where that is not known.
         valid: (V, H, W) bool, false for pixels that no loss should count: dead ones, and those that counted nothing.
             None where all are valid.
         test: (V,) bool, views that reconstruction never sees.
@@ -62,7 +62,7 @@ class ProjectionCapture:
             variance = self._of_pixels("variance", self.variance)
             self._require_finite("variance", variance, valid)
             if not bool((variance[kept] > 0).all()):
-                raise CaptureError(f"The variance of '{self.name}' is not greater than 0 in all valid pixels; correct it.")
+                raise CaptureError(f"The variance of '{self.name}' must be greater than 0 in all valid pixels.")
             object.__setattr__(self, "variance", variance)
         test = self._mask("test", self.test, self.geometry.shape[:1])
         test = torch.zeros(self.geometry.num_views, dtype=torch.bool) if test is None else test
@@ -92,9 +92,8 @@ class ProjectionCapture:
         geometry = self.geometry.select(indices)
         chosen = torch.arange(self.geometry.num_views)[torch.as_tensor(indices).cpu()].reshape(-1)
         parts = {n: getattr(self, n) for n in ("line_integrals", "variance", "valid", "test")}
-        return dataclasses.replace(
-            self, geometry=geometry, **{name: None if part is None else part[chosen] for name, part in parts.items()}
-        )
+        taken: dict[str, Any] = {name: None if part is None else part[chosen] for name, part in parts.items()}
+        return dataclasses.replace(self, geometry=geometry, **taken)
 
     @staticmethod
     def from_intensities(
@@ -159,9 +158,22 @@ class ProjectionCapture:
         raw = read_scan(Path(path), chosen)
         held_out = np.zeros(raw.geometry.num_views, dtype=bool) if raw.test is None else np.asarray(raw.test) != 0
         if held_out.shape == (raw.geometry.num_views,):
-            held_out = held_out | _every(holdout_every, len(held_out))
+            held_out = held_out | ProjectionCapture.held_out(holdout_every, len(held_out)).numpy()
         name = Path(path).resolve().name.split(".")[0]
         return _captured(raw, name, chosen.gaussian, torch.from_numpy(held_out))
+
+    @staticmethod
+    def held_out(every: int | None, views: int) -> torch.Tensor:
+        """(V,) bool, one of so many views, from the middle of the first so many; None or 0 for none.
+
+        Raises:
+            CaptureError: The number is 1, negative, or greater than that of the views.
+        """
+        if every is None or every == 0:
+            return torch.zeros(views, dtype=torch.bool)
+        if isinstance(every, bool) or not isinstance(every, int) or not 2 <= every <= views:
+            raise CaptureError(f"Every {shown(every)}th view cannot be held out of {views}; give 0, or 2 to {views}.")
+        return torch.arange(views) % every == every // 2
 
     def save(self, path: str | Path) -> None:
         """Writes the capture as ``.npz`` or, with the package h5py, as ``.h5``; `load` reads back the same.
@@ -199,9 +211,10 @@ class ProjectionCapture:
             wrong &= valid
         if bool(wrong.any()):
             view, row, column = torch.nonzero(wrong)[0].tolist()
+            value = float(values[view, row, column])
             raise CaptureError(
-                f"The {what} of '{self.name}' hold {shown(float(values[view, row, column]))} in view {view} at row {row}, "
-                f"column {column}; correct it, or mark such pixels as not valid."
+                f"The {what} of '{self.name}' hold {value} in view {view} at row {row}, column {column}; correct it, "
+                "or mark such pixels as not valid."
             )
 
 
@@ -212,8 +225,8 @@ def _captured(raw: RawScan, name: str, sigma: float, test: torch.Tensor | None) 
         counts = _array(raw.intensities, "intensities")
         if counts.shape != raw.geometry.shape:
             raise CaptureError(
-                f"The intensities of '{name}' have shape {counts.shape}, but the geometry has {raw.geometry.shape} views, "
-                "rows and columns; correct either."
+                f"The intensities of '{name}' have shape {counts.shape}, but the geometry has {raw.geometry.shape}; "
+                "correct either."
             )
         found = absorbed(counts, raw.flat, raw.dark, sigma, name)
         notes, values, variance = (*notes, *found.notes), found.line_integrals, found.variance
@@ -226,19 +239,9 @@ def _captured(raw: RawScan, name: str, sigma: float, test: torch.Tensor | None) 
         torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32)),
         None if variance is None else torch.from_numpy(np.ascontiguousarray(variance, dtype=np.float32)),
         None if everywhere else torch.from_numpy(np.ascontiguousarray(np.asarray(valid) != 0)),
-        test,
+        test,  # type: ignore[arg-type]  # becomes a mask
         name,
     )
-
-
-def _every(count: int | None, views: int) -> np.ndarray:
-    """(V,) bool, one of so many views."""
-    if count is None or count == 0:
-        return np.zeros(views, dtype=bool)
-    if isinstance(count, bool) or not isinstance(count, int) or not 2 <= count <= views:
-        raise CaptureError(f"Every {shown(count)}th view cannot be held out of {views}; give 0, or 2 to {views}.")
-    held_out: np.ndarray = np.arange(views) % count == count // 2
-    return held_out
 
 
 def _array(given: Any, what: str) -> np.ndarray:

@@ -100,7 +100,7 @@ class _Projector:
         stored = volume.permute(2, 1, 0)
         if linear:
             stored = torch.nn.functional.pad(stored[None, None], [1] * 6, mode="replicate")[0, 0]
-        nz, ny, nx = stored.shape
+        _, ny, nx = stored.shape
         self._voxels = Voxels(
             values=b.floats(stored.contiguous().to(b.device)),
             lower=b.opaque(begin),

@@ -130,7 +130,9 @@ def integrate(b: Backend, voxels: Voxels, rays: VoxelRays, linear: bool) -> Any:
             times.append(dr.select(rays.direction[axis] == 0.0, dr.inf, time))
         first = dr.fmin(times[0], dr.fmin(times[1], times[2]))
         end = dr.fmax(t, dr.fmin(first, rays.far))
-        mean = _mean(b, voxels, rays, index, walls, ahead, t, end) if linear else dr.gather(b.Float, voxels.values, index)
+        mean = (
+            _mean(b, voxels, rays, index, walls, ahead, t, end) if linear else dr.gather(b.Float, voxels.values, index)
+        )
         total = dr.fma(mean, end - t, total)
         on_x = times[0] == first
         on_y = ~on_x & (times[1] == first)
@@ -153,16 +155,15 @@ def _mean(
     """Mean between two places in a cell of what is trilinear there, and so cubic along the ray."""
     y, z = voxels.strides
     corners = [
-        dr.gather(b.Float, voxels.values, index + shift) for shift in (0, y, z, y + z, b.UInt(1), y + 1, z + 1, y + z + 1)
+        dr.gather(b.Float, voxels.values, index + shift)
+        for shift in (0, y, z, y + z, b.UInt(1), y + 1, z + 1, y + z + 1)
     ]
     middle, half = 0.5 * (begin + end), end - begin
     base = [dr.select(ahead[axis], walls[axis] - 1.0, walls[axis]) for axis in range(3)]
     total = b.Float(0)
     for sign in (-_GAUSS, _GAUSS):
         t = dr.fma(half, sign, middle)
-        u, v, w = (
-            dr.fmin(dr.fmax(dr.fma(rays.direction[a], t, rays.origin[a]) - base[a], 0.0), 1.0) for a in range(3)
-        )
+        u, v, w = (dr.fmin(dr.fmax(dr.fma(rays.direction[a], t, rays.origin[a]) - base[a], 0.0), 1.0) for a in range(3))
         c = [dr.fma(far - near, u, near) for near, far in zip(corners[:4], corners[4:])]
         lower, upper = dr.fma(c[1] - c[0], v, c[0]), dr.fma(c[3] - c[2], v, c[2])
         total += dr.fma(upper - lower, w, lower)

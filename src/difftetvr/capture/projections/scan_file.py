@@ -48,14 +48,18 @@ def write_scan(path: str | Path, geometry: Mapping[str, Any], arrays: Mapping[st
     """
     require_scan_format(path)
     text = json.dumps(geometry)
-    require_room(path, len(text) + sum(array.nbytes for array in arrays.values() if array.dtype.kind != "b"), CaptureError)
+    named: dict[str, Any] = dict(arrays)
+    require_room(
+        path, len(text) + sum(array.nbytes for array in arrays.values() if array.dtype.kind != "b"), CaptureError
+    )
     with atomic_write(path, CaptureError) as temporary:
         if Path(path).suffix.lower() == ".npz":
             with temporary.open("wb") as file:
-                np.savez(file, geometry=np.array(text), **arrays)
+                np.savez(file, geometry=np.array(text), **named)
             return
         h5py = load_h5py(Path(path))
-        with h5py.File(temporary, "w") as file:
+        # The file is locked already, as a sign of life.
+        with h5py.File(temporary, "w", locking=False) as file:
             file.attrs["format"] = "difftetvr-projections"
             file["geometry"] = text
             for name, array in arrays.items():

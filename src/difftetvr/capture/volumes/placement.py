@@ -71,3 +71,27 @@ class Placement(NamedTuple):
         x, y, z = (-0.5 * (extents / extents.max()) @ directions).tolist()
         dx, dy, dz = (steps / extents.max()).tolist()
         return Placement(self.source, self.shape, (dx, dy, dz), directions, World((x, y, z)))
+
+    def in_world_order(self) -> Placement:
+        """The same places with the samples in the order of the world's axes, as `load_volume` has them.
+
+        Raises:
+            CaptureError: The axes are not at right angles.
+        """
+        require_right_angles(self.directions, self.source)
+        axes, signs = nearest_axes(self.directions)
+        order = [axes.index(axis) for axis in range(3)]
+        steps = np.array(self.spacing)[:, None] * self.directions
+        reversed_axes = np.array([sign < 0 for sign in signs])
+        first = np.array(self.world.origin) + ((np.array(self.shape) - 1) * reversed_axes) @ steps
+        directions = (self.directions * np.array(signs, dtype=np.float64)[:, None])[order]
+        nx, ny, nz = (self.shape[axis] for axis in order)
+        dx, dy, dz = (self.spacing[axis] for axis in order)
+        x, y, z = first.tolist()
+        return Placement(self.source, (nx, ny, nz), (dx, dy, dz), directions, self.world._replace(origin=(x, y, z)))
+
+    @property
+    def is_told(self) -> bool:
+        """Whether the file tells a place at all; else samples are at whole numbers, from 0."""
+        is_plain = bool((self.directions == np.eye(3)).all()) and set(self.spacing) == {1.0}
+        return not is_plain or self.world != World()

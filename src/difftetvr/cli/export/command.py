@@ -31,7 +31,7 @@ class Export:
     """Mesh, in any format that is read."""
     output: Annotated[Path, Positional, arg(metavar="OUT")]
     """File to write. A mesh: .vtu, .vtk, .msh, .xdmf, .npz, .bintet, .ovm, .node with its .ele, or .mesh with
-    --geometry. A grid: .nrrd, .vti or .npy. A surface: .ply, .glb, .vtp, .obj or .stl."""
+    --geometry. A grid: .nrrd, .vti, .nii or .npy. A surface: .ply, .glb, .vtp, .obj or .stl."""
     geometry: bool = False
     """Leave out color, density and all other data."""
     without_harmonics: bool = False

@@ -42,12 +42,32 @@ class GridOptions:
 
     def write(self, job: Job) -> None:
         """Samples and writes."""
+        self.require_valid()
+        scalars = scalars_of(job)
+        self.write_sampled(job, scalars, *self._grids(job))
+
+    def require_valid(self) -> None:
+        """Checks how a grid takes its values, before anything is read."""
+        from difftetvr.sampling.slabs import Sampling
+
+        Sampling(self.samples, self.outside)
+
+    def write_sampled(
+        self, job: Job, scalars: dict[str, Scalar], sampled: Grid, written: Grid, x_first: bool = False
+    ) -> None:
+        """Writes what a mesh has on a grid.
+
+        Args:
+            job: What is written where.
+            scalars: Of the mesh, by name.
+            sampled: Where to sample in the mesh's world.
+            written: What the file says of that.
+            x_first: Whether the axes of a .npy are x, y, z.
+        """
         from difftetvr.fitting.beginning.requirements import resolve_device
         from difftetvr.sampling.slabs import MeshValues, Sampling, write_sampled
 
         sampling = Sampling(self.samples, self.outside)
-        scalars = _scalars(job)
-        sampled, written = self._grids(job)
         device = resolve_device(self.device)
         dtype = dtype_for([scalar.values for scalar in scalars.values()])
         meshes = {id(scalar.mesh): scalar.mesh.to(device, dtype) for scalar in scalars.values()}
@@ -56,7 +76,7 @@ class GridOptions:
             for name, scalar in scalars.items()
         }
         with waiting(job.console, f"Sampling {counted(sampled.num_points, 'point')}"):
-            write_sampled(job.output, arrays, sampled, sampling, written)
+            write_sampled(job.output, arrays, sampled, sampling, written, x_first)
         job.say(f"Wrote {job.output} ({' x '.join(map(str, written.shape))} points, {listed(list(arrays))})")
 
     def _grids(self, job: Job) -> tuple[Grid, Grid]:
@@ -73,14 +93,27 @@ class GridOptions:
             raise MeshError("--like takes the grid of a volume; leave out --spacing and --size.")
         with waiting(job.console, f"Reading {self.like}"):
             placement = Placement.of(self.like)
+        return self.grids_like(job, placement)
+
+    def grids_like(self, job: Job, placement: Placement) -> tuple[Grid, Grid]:
+        """Where the samples of a volume are in the mesh's world, and in that of the volume's file.
+
+        Args:
+            job: What is written where.
+            placement: Of the volume of --like.
+
+        Raises:
+            MeshError: The mesh lies elsewhere.
+        """
+        assert self.like is not None
         run = job.run
         is_own = run is not None and _is_same(self.like, run.capture)
         if is_own and not self.fitted:
             job.say(f"{job.model} was fitted to {self.like}: its box is laid onto that of the samples.")
-        sampled = written = _grid_of(placement)
+        sampled = written = grid_of(placement)
         if self.fitted or is_own:
             spacing = run.capture_options.spacing if run is not None and is_own else None
-            sampled = _grid_of(placement.in_views(spacing))
+            sampled = grid_of(placement.in_views(spacing))
         self._require_overlap(job, sampled)
         return sampled, written
 
@@ -102,7 +135,7 @@ class GridOptions:
             )
 
 
-def _scalars(job: Job) -> dict[str, Scalar]:
+def scalars_of(job: Job) -> dict[str, Scalar]:
     """What a grid has, by name.
 
     Raises:
@@ -143,7 +176,8 @@ def _names_of_values(job: Job) -> list[str]:
     return names
 
 
-def _grid_of(placement: Placement) -> Grid:
+def grid_of(placement: Placement) -> Grid:
+    """The grid of a volume's samples."""
     from difftetvr.sampling import Grid
 
     is_plain = bool((placement.directions == np.eye(3)).all())

@@ -42,8 +42,8 @@ def read_exchange(path: Path, file: PlainFile, options: ScanOptions) -> RawScan:
     angles = _angles(path, file, shape[0], notes)
     if options.center is None:
         notes.append(
-            f"'{path}' does not tell where the axis is; it is taken as the middle of a row, {shape[2] / 2:g} pixels from "
-            "the left edge, unless center says otherwise."
+            f"'{path}' does not tell where the axis is; it is taken as the middle of a row, {shape[2] / 2:g} pixels "
+            "from the left edge, unless center says otherwise."
         )
     step = options.pixel_size or 1.0
     shift = 0.0 if options.center is None else (0.5 * shape[2] - options.center) * step

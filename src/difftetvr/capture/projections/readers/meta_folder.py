@@ -99,12 +99,14 @@ def _projection(file: Path, frame: Mapping[str, Any], shape: tuple[int, ...]) ->
 def _variance(
     scanner: Mapping[str, Any], values: np.ndarray, test: np.ndarray, file: Path
 ) -> tuple[np.ndarray | None, tuple[str, ...]]:
-    """Variances by the noise that the scanner tells, TIGRE's; its test views have none, and count as noisy as others."""
+    """Variances by the noise that the scanner tells, TIGRE's; test views have none, and count as noisy as others."""
+    photons: Any
+    gaussian: Any
     photons, gaussian = scanner.get("possion_noise"), scanner.get("gaussian_noise")  # as they write it
     is_told = isinstance(photons, int | float) and isinstance(gaussian, list) and len(gaussian) == 2
     scale = float(np.nanmax(values[~test])) if not test.all() else 0.0
     if not scanner.get("noise") or not is_told or not scale > 0 or not isinstance(gaussian[1], int | float):
         return None, ()
     counts = np.maximum(photons * np.exp(-values.astype(np.float64) / scale), 0.5)
-    note = f"The noise of '{file}' is taken as TIGRE's, {photons:g} photons and {gaussian[1]:g} counts, of its own maximum."
+    note = f"The variances of '{file}' are those of TIGRE's noise, {photons:g} photons and {gaussian[1]:g} counts."
     return (scale**2 * log_variance(counts, float(gaussian[1]))).astype(np.float32), (note,)

@@ -28,7 +28,7 @@ def read_npz(path: Path, options: ScanOptions) -> RawScan:
     options.refuse_others(path, "gaussian")
     arrays = read_arrays(path, CaptureError, lambda name, shape: name in (*_ARRAYS, GEOMETRY))
     text = arrays.pop(GEOMETRY, None)
-    if text is None or text.size != 1 and text.dtype.kind != "u":
+    if text is None or (text.size != 1 and text.dtype.kind != "u"):
         raise CaptureError(f"'{path}' has no 'geometry', the text of a geometry file; add it.")
     return _scan(path, _decoded(text), arrays)
 
@@ -62,7 +62,7 @@ def read_hdf5(path: Path, options: ScanOptions) -> RawScan:
     raise CaptureError(f"'{path}' holds neither 'geometry', as files of ours, nor '{PROJECTIONS}', as Data Exchange.")
 
 
-def _scan(path: Path, geometry: str, arrays: dict[str, np.ndarray]) -> RawScan:
+def _scan(path: Path, geometry: str, arrays: dict[str, Any]) -> RawScan:
     values = [name for name in _VALUES if name in arrays]
     if len(values) != 1:
         raise CaptureError(f"'{path}' needs either 'line_integrals' or 'intensities'; store one of them.")

@@ -63,8 +63,8 @@ def scan_of(entries: Entries, angles: Floats, *, upward: bool = True) -> Circula
         source, detector = (_each(entries, name, count) for name in ("DSO", "DSD"))
         if not (detector > source).all() or not (source > 0).all():
             raise CaptureError(
-                f"{entries.source} has DSD {detector[0]:g} and DSO {source[0]:g}, so that its detector is not behind the "
-                "axis; DSD is the distance from source to detector, and greater than DSO."
+                f"{entries.source} has DSD {detector[0]:g} and DSO {source[0]:g}, so that its detector is not behind "
+                "the axis; DSD is the distance from source to detector, and greater than DSO."
             )
         distances = {"source_distance": source, "detector_distance": detector}
     turns = _per_view(entries, "rotDetector", 3, count)[:, ::-1]  # roll around z, pitch around y, yaw around x
@@ -83,7 +83,12 @@ def scan_of(entries: Entries, angles: Floats, *, upward: bool = True) -> Circula
 
 def _angles(entries: Entries) -> Floats:
     found = as_numbers(entries.required("angles"))
-    if found is None or not found.size or found.ndim not in (1, 2) or (found.ndim == 2 and found.shape[1] not in (1, 3)):
+    if (
+        found is None
+        or not found.size
+        or found.ndim not in (1, 2)
+        or (found.ndim == 2 and found.shape[1] not in (1, 3))
+    ):
         entries.refuse("angles", "give radians, one for each view, or three of them as TIGRE has")
     if found.ndim == 2 and (found.shape[1] == 1 or not found[:, 1:].any()):
         found = found[:, 0]
