@@ -33,14 +33,16 @@ ALLOWED = {
     "sampling": GROUND | {"backend", "mesh", "rendering"},
     "capture": GROUND | {"backend", "mesh", "optics", "rendering"},
     "fitting": GROUND | {"backend", "recording", "terminal", "mesh", "optics", "rendering", "capture"},
-    "view": GROUND | {"backend", "mesh", "optics", "rendering", "capture", "fitting"},
+    "inverse": GROUND
+    | {"backend", "recording", "terminal", "mesh", "optics", "rendering", "sampling", "capture", "fitting"},
+    "view": GROUND | {"backend", "mesh", "optics", "rendering", "sampling", "capture", "fitting", "inverse"},
 }
 """Parts, each with the parts it may import besides itself. `cli` and the package's surface may import all.
 
 `view` and `fitting` are one storey; of the two, the one that shows results may know what a result is, never the other.
 """
 
-MAY_TOUCH_DRJIT = {"backend", "recording", "mesh", "optics", "rendering", "sampling", "capture", "fitting"}
+MAY_TOUCH_DRJIT = {"backend", "recording", "mesh", "optics", "rendering", "sampling", "capture", "fitting", "inverse"}
 """Parts that hold kernels, or torch functions around them."""
 
 

@@ -4,6 +4,7 @@ from . import cli as cli
 from . import errors as errors
 from . import files as files
 from . import fitting as fitting
+from . import inverse as inverse
 from . import mesh as mesh
 from . import optics as optics
 from . import recording as recording

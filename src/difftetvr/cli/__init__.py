@@ -69,7 +69,7 @@ def parse_command(args: Sequence[str]) -> Any:
     """
     from difftetvr.cli.parsing import parse
 
-    kind: Any = command_type(args[0])
+    kind = _variant(command_type(args[0]), args[1:])
     return parse(kind, args[0], args[1:], _saved(kind, args[1:]))
 
 
@@ -152,14 +152,20 @@ def _tell(out: Console, given: Sequence[str]) -> bool:
     elif any(word in _HELP for word in given[1:]):
         from difftetvr.cli.help import print_help
 
-        kind = command_type(given[0])
+        words = [word for word in given[1:] if word not in _HELP]
+        kind = _variant(command_type(given[0]), words)
         saved = None
         with contextlib.suppress(DiffTetError):  # help is there for whoever names the wrong file, too
-            saved = _saved(kind, [word for word in given[1:] if word not in _HELP])
+            saved = _saved(kind, words)
         print_help(out, given[0], kind, saved)
     else:
         return False
     return True
+
+
+def _variant(kind: Any, args: Sequence[str]) -> Any:
+    """The dataclass of a command for its arguments, where there are several by what these name."""
+    return kind.variant(args) if hasattr(kind, "variant") else kind
 
 
 def _saved(kind: Any, args: Sequence[str]) -> Any:

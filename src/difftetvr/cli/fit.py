@@ -145,6 +145,13 @@ class Fit:
         return {"capture": self.capture, "capture_options": self.views_of.given(), "fit": self.config.to_json()}
 
     @staticmethod
+    def variant(args: Sequence[str]) -> type:
+        """This command, or that for projections, where the arguments name some."""
+        from difftetvr.cli.fit_scan import FitScan, fits_scan  # most fits are of images
+
+        return FitScan if fits_scan(args) else Fit
+
+    @staticmethod
     def defaults(args: Sequence[str]) -> Fit | None:
         """The command with the options that ``args`` need not give, ``tyro.MISSING`` where it must; None: as declared.
 

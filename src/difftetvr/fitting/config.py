@@ -12,7 +12,7 @@ import numpy as np
 from difftetvr.declared import require_declared
 from difftetvr.errors import FitError
 from difftetvr.fitting.motion import Motion
-from difftetvr.fitting.options import LARGEST_COUNT, options_from_json, require
+from difftetvr.fitting.options import LARGEST_COUNT, first_difference, options_from_json, require
 from difftetvr.fitting.refinement import Exchange, Grow, Star, Strategy
 from difftetvr.mesh.limits import CELLS_PER_CUBE, MAX_CELLS, MAX_DEGREE
 
@@ -300,7 +300,7 @@ class FitConfig:
         Raises:
             FitError: An option that decides the steps differs; names the first one.
         """
-        differing = _first_difference(self, other)
+        differing = first_difference(self, other, _FREE_OPTIONS)
         if differing is not None:
             name, mine, theirs = differing
             raise FitError(
@@ -324,17 +324,6 @@ class FitConfig:
     def _view(self, position: int, view_count: int) -> int:
         epoch, offset = divmod(position, view_count)
         return int(np.random.default_rng([self.seed, _VIEW_STREAM, epoch]).permutation(view_count)[offset])
-
-
-def _first_difference(first: Any, second: Any, prefix: str = "") -> tuple[str, object, object] | None:
-    """Name and both values of the first option that decides the steps and differs; None if there is none."""
-    for item in dataclasses.fields(first):
-        name, mine, theirs = f"{prefix}{item.name}", getattr(first, item.name), getattr(second, item.name)
-        if name in _FREE_OPTIONS or mine == theirs:
-            continue
-        within = _first_difference(mine, theirs, f"{name}.") if dataclasses.is_dataclass(mine) else None
-        return within or (name, mine, theirs)
-    return None
 
 
 def _positive(value: float) -> bool:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import NoneType
+from typing import Any, Protocol
 
 import torch
 
@@ -17,6 +18,7 @@ from difftetvr.errors import FitError, shown
 from difftetvr.fitting.config import FitConfig
 from difftetvr.fitting.processes import ALONE, Processes
 from difftetvr.fitting.records.checkpoint import Checkpoint, alone_with, require_no_folder
+from difftetvr.fitting.records.history import History
 from difftetvr.fitting.records.result import FitResult, Progress
 from difftetvr.fitting.refinement import Strategy
 from difftetvr.fitting.trainer import Trainer
@@ -136,8 +138,8 @@ def optimise(
         FitError: The checkpoint cannot be written, or the loss is not finite.
         KeyboardInterrupt: The run was interrupted; the checkpoint is saved.
     """
-    with _one_torch_thread():
-        _run(trainer, path, on_progress)
+    with one_torch_thread():
+        iterate(trainer, path, on_progress)
         evaluation = trainer.evaluate(trainer.capture.test_indices.tolist())
     field = trainer.parameters.detached_field()
     return FitResult(trainer.mesh, field, evaluation, trainer.history, trainer.config)
@@ -154,8 +156,41 @@ def _require_kinds(capture: object, config: object, mesh: object, strategy: obje
         raise FitError(f"on_progress is {shown(on_progress)}; pass a function.")
 
 
-def _run(trainer: Trainer, path: Path | None, on_progress: Callable[[Progress], None] | None) -> None:
-    """Iterates to the end, with glances and checkpoints on the way."""
+class Run(Protocol):
+    """What iterates: a reconstruction of any kind, between two iterations."""
+
+    config: Any
+    history: History
+    processes: Processes
+    iteration: int
+
+    def step(self) -> None:
+        """One iteration."""
+
+    def glance(self) -> None:
+        """Notes how held-out views look, for the curves."""
+
+    def progress(self, seconds: float) -> Progress:
+        """A summary for a display."""
+        ...
+
+    def checkpoint(self) -> Checkpoint:
+        """The state, to be saved."""
+        ...
+
+
+def iterate(trainer: Run, path: Path | None, on_progress: Callable[[Progress], None] | None) -> None:
+    """Iterates to the end, with glances and checkpoints on the way.
+
+    Args:
+        trainer: Where to begin; its options say how far to go, how often to glance and to save.
+        path: Checkpoint to write.
+        on_progress: Called after every iteration.
+
+    Raises:
+        FitError: The checkpoint cannot be written, or what an iteration raises.
+        KeyboardInterrupt: The run was interrupted; the checkpoint is saved.
+    """
     config, history, processes = trainer.config, trainer.history, trainer.processes
     file = path if processes.is_first else None
     if file is not None and trainer.iteration < config.steps:
@@ -189,7 +224,7 @@ def _run(trainer: Trainer, path: Path | None, on_progress: Callable[[Progress], 
 
 
 @contextmanager
-def _one_torch_thread() -> Iterator[None]:
+def one_torch_thread() -> Iterator[None]:
     """Leaves the cores to the renderer.
 
     Torch's share of an iteration is many small operations. With several threads each of them waits for all cores,

@@ -89,5 +89,24 @@ def options_from_json(kind: type[_Options], values: object, path: str = "") -> _
     return kind(**options)
 
 
+def first_difference(
+    first: Any, second: Any, free: frozenset[str], prefix: str = ""
+) -> tuple[str, object, object] | None:
+    """Name and both values of the first option in which two runs differ; None if there is none.
+
+    Args:
+        first, second: Their options.
+        free: Names of those that may.
+        prefix: What stands before the names.
+    """
+    for item in dataclasses.fields(first):
+        name, mine, theirs = f"{prefix}{item.name}", getattr(first, item.name), getattr(second, item.name)
+        if name in free or mine == theirs:
+            continue
+        within = first_difference(mine, theirs, free, f"{name}.") if dataclasses.is_dataclass(mine) else None
+        return within or (name, mine, theirs)
+    return None
+
+
 def _has_default(item: dataclasses.Field[Any]) -> bool:
     return item.default is not dataclasses.MISSING or item.default_factory is not dataclasses.MISSING

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import torch
 
@@ -15,6 +15,66 @@ from difftetvr.mesh.tetmesh import TetMesh
 _FIRST, _SECOND = "exp_avg", "exp_avg_sq"  # Adam's names of its moments
 # Gradients of a mean over pixels shrink as cells and pixels do; Adam's usual 1e-8 would drown those of fine meshes.
 _EPSILON = 1e-15
+
+
+class CarriedAdam:
+    """Adam for values on the vertices or cells of a mesh, whose moments follow changes of the mesh."""
+
+    def __init__(self, groups: Sequence[Sequence[torch.Tensor]], rate: float, betas: tuple[float, float]) -> None:
+        """Starts at rest.
+
+        Args:
+            groups: Leaf tensors, (N, ...), those that share a learning rate together.
+            rate: Learning rate until the first step says another.
+            betas: Decay of first and second moments.
+        """
+        options = [{"params": list(group)} for group in groups if group]
+        self._optimizer = torch.optim.Adam(options, lr=rate, betas=betas, eps=_EPSILON, fused=True)
+        # Adam would make its state in the first step; made here, a checkpoint holds the same arrays from the start.
+        for parameter in (parameter for group in groups for parameter in group):
+            zeros = torch.zeros_like(parameter, requires_grad=False)
+            self._optimizer.state[parameter] = {
+                "step": torch.zeros((), device=parameter.device),
+                _FIRST: zeros,
+                _SECOND: zeros.clone(),
+            }
+
+    def state(self, parameter: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Moments of a parameter, and its count of steps, by name."""
+        found: dict[str, torch.Tensor] = self._optimizer.state[parameter]
+        return found
+
+    def carry(self, parameter: torch.Tensor, value: torch.Tensor, change: MeshChange) -> torch.Tensor:
+        """A parameter's successor on the mesh after a change, at rest where vertices are new.
+
+        The first moment of new ones is 0, the second the mean of the ends of the edge they lie on. The count of steps
+        goes on for all.
+
+        Args:
+            parameter: The parameter, on the mesh before it.
+            value: (N', ...) its value after it.
+            change: What was done to the mesh.
+        """
+        state = self._optimizer.state.pop(parameter)
+        first = change.carry(state[_FIRST])
+        is_new = change.is_new.view(-1, *[1] * (first.ndim - 1))
+        state[_FIRST] = torch.where(is_new, 0.0, first)
+        state[_SECOND] = change.carry(state[_SECOND])
+        carried = value.requires_grad_()
+        self._optimizer.state[carried] = state
+        for group in self._optimizer.param_groups:
+            group["params"] = [carried if one is parameter else one for one in group["params"]]
+        return carried
+
+    def zero_grad(self) -> None:
+        """Forgets the gradients."""
+        self._optimizer.zero_grad(set_to_none=True)
+
+    def step(self, rates: Sequence[float]) -> None:
+        """One step with the accumulated gradients, and a rate for each group."""
+        for group, rate in zip(self._optimizer.param_groups, rates):
+            group["lr"] = rate
+        self._optimizer.step()
 
 
 class FieldParameters:
@@ -62,16 +122,7 @@ class FieldParameters:
         self.color, self.density = color.requires_grad_(), density.requires_grad_()
         self.harmonics = None if harmonics is None else harmonics.requires_grad_()
         self._shares = [1.0, config.density_rate or 1.0, config.harmonics_rate]
-        groups = [{"params": group} for group in self._groups() if group]
-        self._optimizer = torch.optim.Adam(groups, lr=config.rate, betas=config.betas, eps=_EPSILON, fused=True)
-        # Adam would make its state in the first step; made here, a checkpoint holds the same arrays from the start.
-        for _, parameter in self._items():
-            zeros = torch.zeros_like(parameter, requires_grad=False)
-            self._optimizer.state[parameter] = {
-                "step": torch.zeros((), device=device),
-                _FIRST: zeros,
-                _SECOND: zeros.clone(),
-            }
+        self._optimizer = CarriedAdam(self._groups(), config.rate, config.betas)
 
     def field(self, bands: int) -> Field:
         """The field that the parameters stand for, differentiable in them.
@@ -108,8 +159,7 @@ class FieldParameters:
     def carry(self, change: MeshChange) -> None:
         """Follows a change of the mesh, for parameters on vertices.
 
-        Kept vertices keep their values and moments. New ones start with interpolated values at rest: first moment 0,
-        second moment the mean of the ends of the edge they lie on. The count of steps goes on for all. None of the new
+        Kept vertices keep their values and moments. New ones start with interpolated values at rest. None of the new
         ones is known to be free.
 
         Args:
@@ -121,17 +171,8 @@ class FieldParameters:
         self.density_unit = unit
         self.is_free = self.is_free[change.parents[:, 0].long()] & ~change.is_new
         for name, parameter in list(self._items()):
-            state = self._optimizer.state.pop(parameter)
-            first = change.carry(state[_FIRST])
-            is_new = change.is_new.view(-1, *[1] * (first.ndim - 1))
-            state[_FIRST] = torch.where(is_new, 0.0, first)
-            state[_SECOND] = change.carry(state[_SECOND])
-            carried = density if name == "density" else change.carry(parameter.detach())
-            carried.requires_grad_()
-            self._optimizer.state[carried] = state
-            setattr(self, name, carried)
-        for group, parameters in zip(self._optimizer.param_groups, self._groups()):
-            group["params"] = parameters
+            value = density if name == "density" else change.carry(parameter.detach())
+            setattr(self, name, self._optimizer.carry(parameter, value, change))
 
     def keep_free(self, is_free: torch.Tensor) -> None:
         """Makes the field empty where nothing can be, now and after all further steps.
@@ -156,7 +197,7 @@ class FieldParameters:
 
     def zero_grad(self) -> None:
         """Forgets the gradients before the views of a step are accumulated."""
-        self._optimizer.zero_grad(set_to_none=True)
+        self._optimizer.zero_grad()
 
     def step(self, rate: float, haze_penalty: float) -> None:
         """One projected Adam step with the accumulated gradients.
@@ -166,18 +207,16 @@ class FieldParameters:
             haze_penalty: This many mean absolute density gradients are added to every density gradient. Where images
                 say something they drown it; fog that no image can tell from the background decays.
         """
-        for group, share in zip(self._optimizer.param_groups, self._shares):
-            group["lr"] = share * rate
         if haze_penalty and self.density.grad is not None:
             self.density.grad += haze_penalty * self.density.grad.abs().mean()
-        self._optimizer.step()
+        self._optimizer.step([share * rate for share in self._shares])
         self._project()
 
     def state(self) -> dict[str, torch.Tensor]:
         """Parameters and optimiser state by name: all that the next step depends on."""
         tensors = {**dict(self._items()), "density_unit": self.density_unit, "is_free": self.is_free}
         for name, parameter in self._items():
-            for key, value in self._optimizer.state[parameter].items():
+            for key, value in self._optimizer.state(parameter).items():
                 tensors[f"{name}.{key}"] = value
         return tensors
 

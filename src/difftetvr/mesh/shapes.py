@@ -128,13 +128,11 @@ def measure_vertices(mesh: TetMesh, weigh: Callable[[Any], Any] | None = None) -
             torch.zeros_like(points[:, 0]), torch.zeros_like(points[:, :3]), CellShapes(scale, nothing, nothing)
         )
     backend = _backend(points)
-    offsets, cells = topology.vertex_cells
     with backend.exclusive():
         source, length = _source(backend, corner_columns(topology), points), few_lengths(topology.num_cells)
         determinants, qualities, corners = replayed(_shapes, source, weigh, length)
-        first, end, around, tets = map(backend.uints, (offsets[:-1], offsets[1:], cells, topology.tets))
-        stars = _StarSource(backend, first, end, around, tets, corners)
-        sums = replayed(_sums_of_stars, stars, few_lengths(topology.num_vertices))
+        stars = StarSource.of(backend, topology, corners)
+        sums = replayed(sums_of_stars, stars, few_lengths(topology.num_vertices), True)
         of_cells = CellShapes(scale, backend.tensor(determinants), backend.tensor(qualities))
         of_vertices = backend.tensor(sums, -1, 4)[: topology.num_vertices]
     altitudes = of_vertices[:, 3]
@@ -179,7 +177,7 @@ class _CellSource:
 
 
 @dataclass
-class _StarSource:
+class StarSource:
     """The cells around vertices, flat.
 
     Attributes:
@@ -187,7 +185,7 @@ class _StarSource:
         first, end: (V,) where each vertex's cells begin and end among ``cells``.
         cells: (4 T,) the cells.
         tets: (T, 4) their vertices.
-        corners: (T, 4, 4) what :func:`_shapes` says about each corner of a cell.
+        corners: (T, 4, 4) four numbers about each corner of a cell.
     """
 
     backend: Backend
@@ -196,6 +194,13 @@ class _StarSource:
     cells: Any
     tets: Any
     corners: Any
+
+    @staticmethod
+    def of(backend: Backend, topology: Topology, corners: Any) -> StarSource:
+        """The cells of a mesh, with what is known of their corners."""
+        offsets, cells = topology.vertex_cells
+        first, end, around, tets = map(backend.uints, (offsets[:-1], offsets[1:], cells, topology.tets))
+        return StarSource(backend, first, end, around, tets, corners)
 
 
 def _measures(source: _CellSource) -> tuple[Any, Any]:
@@ -248,20 +253,21 @@ def _shapes(source: _CellSource, weigh: Callable[[Any], Any] | None, length: int
     return determinant, quality, corners
 
 
-def _sums_of_stars(source: _StarSource, length: int) -> Any:
+def sums_of_stars(source: StarSource, length: int, takes_least: bool) -> Any:
     """What vertices feel of the cells around them, for :func:`difftetvr.recording.replayed`.
 
     Args:
         source: The cells around them.
         length: Number of vertices to make room for.
+        takes_least: Whether of the last of the four numbers the least counts, infinity where there are no cells.
 
     Returns:
-        Flat (length, 4): sums of the gradients, and the least altitude; infinite where there are no cells.
+        Flat (length, 4): sums in the order of the cells, but for such a least number.
     """
     backend, lanes = source.backend, dr.width(source.first)
     vertex = dr.arange(backend.UInt, lanes)
 
-    def add(place: Any, total: Vector, altitude: Any) -> tuple[Any, Vector, Any]:
+    def add(place: Any, total: Vector, last: Any) -> tuple[Any, Vector, Any]:
         cell = dr.gather(backend.UInt, source.cells, place)
         tet = dr.gather(backend.UInt4, source.tets, cell)
         corner = dr.select(
@@ -270,13 +276,14 @@ def _sums_of_stars(source: _StarSource, length: int) -> Any:
             dr.select(tet[1] == vertex, backend.UInt(1), dr.select(tet[2] == vertex, backend.UInt(2), 3)),
         )
         packet = dr.gather(backend.Float4, source.corners, _CORNERS * cell + corner)
-        least = dr.select(packet[3] < altitude, packet[3], altitude)
-        return place + 1, [t + packet[k] for k, t in enumerate(total)], least
+        last = dr.select(packet[3] < last, packet[3], last) if takes_least else last + packet[3]
+        return place + 1, [t + packet[k] for k, t in enumerate(total)], last
 
-    begin = (source.first, [dr.zeros(backend.Float, lanes) for _ in range(3)], dr.full(backend.Float, dr.inf, lanes))
-    _, total, altitude = dr.while_loop(begin, lambda place, *_: place < source.end, add)
+    nothing = dr.full(backend.Float, dr.inf if takes_least else 0.0, lanes)
+    begin = (source.first, [dr.zeros(backend.Float, lanes) for _ in range(3)], nothing)
+    _, total, last = dr.while_loop(begin, lambda place, *_: place < source.end, add)
     result = dr.empty(backend.Float, 4 * length)
-    dr.scatter(result, backend.Floats([*total, altitude]), vertex)
+    dr.scatter(result, backend.Floats([*total, last]), vertex)
     dr.eval(result)
     return result
 

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import safetensors
 import safetensors.torch
@@ -32,13 +32,31 @@ _VERSION = 5
 _HISTORY = ("history.loss", "history.psnr")
 
 
+class RunOptions(Protocol):
+    """Options of a run of any kind."""
+
+    @property
+    def steps(self) -> int:
+        """Iterations of the run."""
+        ...
+
+    def to_json(self) -> dict[str, Any]:
+        """The options as JSON values."""
+        ...
+
+    @staticmethod
+    def from_json(values: object) -> RunOptions:
+        """The inverse of :meth:`to_json`."""
+        ...
+
+
 @dataclass
 class Checkpoint:
     """The state between two iterations.
 
     Attributes:
         iteration: Iterations done.
-        config: Options of the run.
+        config: Options of the run, such as a :class:`FitConfig`.
         capture: What :func:`describe_capture` says about the images it runs on.
         tensors: Mesh, parameters and optimiser state by name.
         budget: Cells that the mesh may have.
@@ -49,7 +67,7 @@ class Checkpoint:
     """
 
     iteration: int
-    config: FitConfig
+    config: Any
     capture: dict[str, Any]
     tensors: dict[str, torch.Tensor]
     budget: int
@@ -90,8 +108,12 @@ class Checkpoint:
             temporary.write_bytes(content)
 
     @staticmethod
-    def load(path: Path) -> Checkpoint:
+    def load(path: Path, options: type[RunOptions] = FitConfig) -> Checkpoint:
         """Reads a checkpoint.
+
+        Args:
+            path: Its file.
+            options: Dataclass of the run's options.
 
         Raises:
             FitError: The file is missing, damaged or of another version.
@@ -112,7 +134,7 @@ class Checkpoint:
         if metadata.get("sha256") != _checksum(metadata["state"], tensors):
             raise _unreadable(path, "its content does not match its checksum")
         try:
-            return _checkpoint(state, tensors, str(path))
+            return _checkpoint(state, tensors, str(path), options)
         except (FitError, KeyError, ValueError, TypeError, AttributeError, OverflowError) as error:
             raise _unreadable(path, _reason(error)) from error
 
@@ -210,11 +232,13 @@ def require_no_folder(path: Path) -> None:
         raise FitError(f"{path} is a folder where the checkpoint should be a file; rename or remove it.")
 
 
-def _checkpoint(state: dict[str, Any], tensors: dict[str, torch.Tensor], source: str) -> Checkpoint:
+def _checkpoint(
+    state: dict[str, Any], tensors: dict[str, torch.Tensor], source: str, options: type[RunOptions]
+) -> Checkpoint:
     """A checkpoint from the parts of a file; whatever is wrong with them raises one of Python's own errors."""
     loss, psnr = (tensors.pop(name).tolist() for name in _HISTORY)
     history = History.from_events(loss, psnr, state)
-    config = FitConfig.from_json(state["config"])
+    config = options.from_json(state["config"])
     iteration, capture = state["iteration"], state["capture"]
     if not isinstance(iteration, int) or not iteration == len(loss) == len(psnr) <= config.steps:
         raise ValueError(f"its history has {len(loss)} losses after {iteration} iterations")

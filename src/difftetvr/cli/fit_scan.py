@@ -1,0 +1,259 @@
+"""The command ``difftetvr fit`` for projections of a tomograph."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shlex
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+
+import tyro
+from tyro.conf import OmitArgPrefixes, Positional, arg
+
+from difftetvr.cli.arguments import Groups
+from difftetvr.cli.options import TRUST_GROUPS, TrustOptions
+from difftetvr.errors import DiffTetError, FitError, counted
+from difftetvr.fitting.options import options_from_json
+from difftetvr.fitting.records.folder import RunFolder
+from difftetvr.inverse.tomography.config import TomographyConfig
+from difftetvr.terminal import waiting
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from difftetvr.capture.projections.projection_capture import ProjectionCapture
+    from difftetvr.inverse.tomography.loop import TomographyResult
+    from difftetvr.inverse.tomography.reconstruction import Reconstruction
+
+
+@dataclass(frozen=True)
+class ScanReading:
+    """How projections are read."""
+
+    holdout_every: int = 10
+    """One of so many views is held out, besides those that the file holds out; 0: none."""
+    geometry: str | None = None
+    """File with the geometry of a .npy; default: the .json of the same name."""
+    center: float | None = None
+    """Where the axis is seen in a row of a Data Exchange file, in pixels from the left edge; default: the middle."""
+    pixel_size: float | None = None
+    """Distance of pixels of a Data Exchange file; default: 1."""
+    unit: str | None = None
+    """Of that distance, such as mm."""
+    gaussian: float = 0.0
+    """Standard deviation of the electronics' noise in counts."""
+
+    def load(self, path: str) -> ProjectionCapture:
+        """The projections.
+
+        Raises:
+            CaptureError: They cannot be read.
+        """
+        from difftetvr.capture.projections.projection_capture import ProjectionCapture
+
+        options = dataclasses.asdict(self)
+        return ProjectionCapture.load(path, options.pop("holdout_every") or None, **options)
+
+
+@dataclass(frozen=True)
+class SavedScanRun:
+    """What the config.json of such a run holds.
+
+    Attributes:
+        capture: Path of the projections.
+        scan_options: How they are read.
+        tomography: How they are reconstructed from.
+    """
+
+    capture: str
+    scan_options: ScanReading
+    tomography: TomographyConfig
+
+
+@dataclass(frozen=True)
+class FitScan:
+    """Reconstruct the densities of a tetrahedral volume from projections of a tomograph."""
+
+    capture: Annotated[str, Positional, arg(metavar="SCAN")]
+    """Projections: .h5 or .npz of difftetvr project, Data Exchange .h5, .npy with its geometry as .json, or a folder
+    with meta_data.json (R2-Gaussian, SAX-NeRF). May be left out with --resume."""
+    output: Annotated[Path, arg(aliases=["-o"], metavar="OUT")]
+    """Folder for the model, its metrics, pictures and checkpoint."""
+    config: Annotated[TomographyConfig, arg(name="")] = field(default_factory=TomographyConfig)
+    reading: OmitArgPrefixes[ScanReading] = field(default_factory=ScanReading)
+    truth: Path | None = None
+    """Volume that the projections are of: its slices are shown beside those found, and compared with; nothing is
+    learned from it."""
+    resume: bool = False
+    """Go on with the run in the output folder, with more --iterations beyond its end; SCAN and options that are not
+    given are taken from it."""
+    overwrite: bool = False
+    """Replace the run in the output folder."""
+    trust: OmitArgPrefixes[TrustOptions] = field(default_factory=TrustOptions)
+    groups: ClassVar[Groups] = {
+        "Most used": (
+            *("output", "cells", "iterations", "total-variation", "holdout-every", "truth"),
+            *("device", "resume", "overwrite"),
+        ),
+        "Objective": ("likelihood", "tikhonov", "rays", "batch-views", "solve-steps", "solve-rays"),
+        "Motion": ("move", "motion.*"),
+        "Refinement": ("refine", "exchange.*", "grow.*"),
+        "Optimisation": ("rate", "final-rate", "betas", "seed", "deterministic"),
+        "How SCAN is read": ("geometry", "center", "pixel-size", "unit", "gaussian"),
+        **TRUST_GROUPS,
+        "Output": ("evaluate-every", "checkpoint-seconds"),
+    }
+
+    def run(self, console: Console) -> None:
+        """Reconstructs, and fills the output folder."""
+        from difftetvr.inverse.tomography.loop import prepare
+        from difftetvr.view.scan_report import read_truth, write_scan_report
+
+        folder = RunFolder(self.output)
+        with folder.claimed():
+            self._require_same_run(folder)
+            folder.require_free(resume=self.resume, overwrite=self.overwrite)
+            capture = self._read(console)
+            truth = None if self.truth is None else read_truth(self.truth)
+            with waiting(console, "Reading the checkpoint" if self.resume else "Making the mesh to begin with"):
+                run = prepare(capture, self.config, None, folder.checkpoint if self.resume else None)
+            _say_choices(console, self.config, run, capture)
+            saved = SavedScanRun(self.capture, self.reading, run.config)
+            options = {**dataclasses.asdict(saved), "tomography": run.config.to_json()}
+            with folder.occupied(options, overwrite=self.overwrite, begun=lambda: run.iteration > 0):
+                result = self._optimise(run, folder, console)
+            with waiting(console, f"Drawing pictures into {self.output}"):
+                compared = write_scan_report(folder, result, run.measurements, truth)
+        _say_result(console, result, compared, folder)
+
+    def _read(self, console: Console) -> ProjectionCapture:
+        from difftetvr.errors import CaptureWarning
+
+        with warnings.catch_warnings(record=True) as caught, waiting(console, f"Reading {self.capture}"):
+            warnings.simplefilter("always", CaptureWarning)
+            capture = self.reading.load(self.capture)
+        for warning in caught:
+            console.print(str(warning.message), highlight=False)
+        return capture
+
+    def _optimise(self, run: Reconstruction, folder: RunFolder, console: Console) -> TomographyResult:
+        from difftetvr.fitting.records.progress import ProgressDisplay
+        from difftetvr.inverse.tomography.loop import optimise
+
+        def on_solve(done: int) -> None:
+            if not console.is_terminal:
+                console.print(f"Solving for densities: {done} of {run.config.solve_steps} steps", highlight=False)
+
+        try:
+            with ProgressDisplay(console) as display:
+                return optimise(run, folder.checkpoint, display, on_solve)
+        except KeyboardInterrupt:
+            command = shlex.join(["difftetvr", "fit", "-o", str(self.output), "--resume"])
+            console.print(f"Interrupted; continue with: {command}")
+            raise
+
+    def _require_same_run(self, folder: RunFolder) -> None:
+        saved = _saved(folder) if self.resume else None
+        if saved is None:
+            return
+        if Path(saved.capture).resolve() != Path(self.capture).resolve():
+            raise FitError(
+                f"The run in {self.output} is of '{saved.capture}', not '{self.capture}'; resume with the same "
+                "projections or choose another folder."
+            )
+        if saved.scan_options != self.reading:
+            raise FitError(f"The run in {self.output} reads its projections otherwise; resume with the same options.")
+        saved.tomography.require_same_run(self.config)
+
+    @staticmethod
+    def defaults(args: Sequence[str]) -> FitScan | None:
+        """The command with the options of the run to go on with; None: as declared.
+
+        Raises:
+            FitError: They cannot be read.
+        """
+        output = _value_of(args, ("-o", "--output"))
+        saved = _saved(RunFolder(Path(output))) if "--resume" in args and output is not None else None
+        if saved is None:
+            return None
+        return FitScan(saved.capture, tyro.MISSING, saved.tomography, saved.scan_options)
+
+
+def fits_scan(args: Sequence[str]) -> bool:
+    """Whether arguments of ``difftetvr fit`` name projections, or a run to go on with that is of some."""
+    from difftetvr.capture.projections.readers.table import is_projection_source  # no command but this one needs it
+
+    options = {"-o", "--output", "--config", "--initial-mesh", "--transfer-function", "--truth", "--geometry"}
+    words = [word for before, word in zip(["", *args], args) if not word.startswith("-") and before not in options]
+    try:
+        if any(is_projection_source(word) for word in words):
+            return True
+    except (DiffTetError, OSError):
+        return False
+    output = _value_of(args, ("-o", "--output"))
+    if "--resume" not in args or output is None:
+        return False
+    try:
+        return "tomography" in json.loads(RunFolder(Path(output)).config.read_bytes())
+    except (OSError, ValueError, TypeError, RecursionError):
+        return False
+
+
+def _value_of(args: Sequence[str], names: Sequence[str]) -> str | None:
+    for word, following in zip(args, [*args[1:], None]):
+        name, _, value = word.partition("=")
+        if name in names:
+            return value or following
+    return None
+
+
+def _saved(folder: RunFolder) -> SavedScanRun | None:
+    """The run in a folder; None if it holds none."""
+    if not folder.config.is_file():
+        return None
+    refusal = f"--resume cannot use {folder.config} (start anew with --overwrite, or mend it)"
+    try:
+        return options_from_json(SavedScanRun, json.loads(folder.config.read_bytes()))
+    except (OSError, ValueError, RecursionError, DiffTetError) as error:
+        raise FitError(f"{refusal}: {error}") from error
+
+
+def _say_choices(console: Console, given: TomographyConfig, run: Reconstruction, capture: ProjectionCapture) -> None:
+    """Says what there is, and what was chosen for it."""
+    scan, unit = run.measurements, capture.geometry.unit
+    _, height, width = capture.geometry.shape
+    per = f" per {unit}" if unit else ""
+    noise = "" if capture.variance is not None else ", noise estimated"
+    console.print(
+        f"{counted(len(scan.train), 'view')} to learn from and {len(scan.test)} held out, {width} x {height} pixels, "
+        f"line integrals up to {scan.peak:.4g}, mean density {scan.density_unit:.4g}{per}{noise}",
+        highlight=False,
+    )
+    if given.cells is None:
+        console.print(f"Chosen for these projections: --cells {run.config.cells}", highlight=False)
+
+
+def _say_result(console: Console, result: TomographyResult, compared: dict[str, Any], folder: RunFolder) -> None:
+    metrics = result.metrics
+    held_out = "no held-out views"
+    if result.score.views:
+        held_out = (
+            f"PSNR {result.score.mean_psnr:.2f} dB, residuals {result.score.mean_noise:.2f} times the noise, over "
+            f"{counted(len(result.score.views), 'view')}"
+        )
+    lines = [f"Held out: {held_out}"]
+    if compared:
+        lines.append(f"Against the truth: PSNR {compared['volume_psnr']:.2f} dB at the voxels' centres")
+    lines += [
+        f"{counted(metrics['cells'], 'cell')}, {counted(metrics['iterations'], 'iteration')} in "
+        f"{metrics['seconds']:.1f} s",
+        f"Model:    {folder.model}",
+        f"Slices:   {folder.cut}",
+        f"Views:    {folder.comparison}",
+        f"Curves:   {folder.curves}",
+    ]
+    console.print("\n".join(lines), highlight=False)

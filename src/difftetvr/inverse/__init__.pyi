@@ -1,0 +1,3 @@
+from . import tomography as tomography
+
+__all__: list[str] = []

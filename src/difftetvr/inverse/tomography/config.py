@@ -1,0 +1,203 @@
+"""Options of a tomographic reconstruction."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal, get_args
+
+import numpy as np
+
+from difftetvr.declared import require_declared
+from difftetvr.errors import FitError
+from difftetvr.fitting.motion import Motion
+from difftetvr.fitting.options import LARGEST_COUNT, first_difference, options_from_json, require
+from difftetvr.fitting.refinement import Exchange, Grow, Strategy
+from difftetvr.mesh.limits import MAX_CELLS
+
+if TYPE_CHECKING:
+    from difftetvr.capture.projections.projection_capture import ProjectionCapture
+
+Likelihood = Literal["gaussian", "poisson", "l1"]
+"""How residuals of line integrals count, see `difftetvr.inverse.tomography.likelihoods`."""
+
+Refine = Literal["exchange", "grow", "none"]
+"""Names of refinement strategies: each but the last is also that of a field of `TomographyConfig`, with its options."""
+
+# Independent streams of random numbers.
+_VIEW_STREAM, _PHASE_STREAM, _REFINEMENT_STREAM = range(3)
+
+_START = 0.1
+"""Part of their best surplus that new vertices start with: a ray passes many of them, and each one's best step would
+mend the same residual."""
+
+_ROUNDS, _ITERATIONS_PER_ROUND = 40, 20
+
+_LEAST_CELLS, _MOST_CELLS, _PIXELS_PER_CELL = 20_000, 300_000, 40
+
+_RANGES = {
+    "cells": (1, MAX_CELLS),
+    "iterations": (1, LARGEST_COUNT),
+    "batch_views": (1, LARGEST_COUNT),
+    "rays": (1, LARGEST_COUNT),
+    "solve_steps": (0, LARGEST_COUNT),
+    "solve_rays": (1, LARGEST_COUNT),
+    "evaluate_every": (0, LARGEST_COUNT),
+    "seed": (0, LARGEST_COUNT),
+}
+# What a resumed run may choose anew: what changes nothing about where the optimisation goes, and how far it goes.
+_FREE_OPTIONS = frozenset({"device", "evaluate_every", "checkpoint_seconds", "iterations", "solve_steps", "solve_rays"})
+
+
+@dataclass(frozen=True)
+class TomographyConfig:
+    """How densities and vertex positions are optimised from line integrals while the mesh refines itself.
+
+    Rates are steps of Adam per iteration in units of the mean density that the scan shows. Steps of vertices are
+    counted in altitudes of their cells.
+    """
+
+    cells: int | None = None
+    """Budget of tetrahedra: the run begins with about as many, and refinement ends within it. Default: one for every 40
+    pixels to learn from, between 20 000 and 300 000."""
+    iterations: int = 1200
+    """Number of optimisation steps; after the last one, densities are solved for once more by themselves."""
+    batch_views: int = 2
+    """Training views per step."""
+    rays: int = 32_768
+    """Rays per step, at most: pixels of each view in equal steps, beginning with another one each time."""
+    likelihood: Likelihood = "gaussian"
+    """How residuals count: squared and weighed by the variance of each line integral where the scan tells one
+    (gaussian), by the counts that they stand for (poisson), or by their magnitudes (l1)."""
+    total_variation: float = 0.02
+    """Weight of the total variation of the density, in units in which noise and total variation are about 1."""
+    tikhonov: float = 0.0
+    """Weight of the squared gradient of the density, likewise."""
+    rate: float = 0.2
+    """Learning rate of densities in the first step."""
+    final_rate: float = 0.005
+    """Learning rate in the last step; in between it falls log-linearly."""
+    betas: tuple[float, float] = (0.9, 0.99)
+    """Decay of Adam's first and second moments."""
+    move: bool = True
+    """Whether vertices move."""
+    refine: Refine = "exchange"
+    """How the mesh refines itself: exchange cells at their full number, grow from a coarse mesh, or not at all."""
+    solve_steps: int = 10
+    """Steps of conjugate gradients after the last iteration, for densities alone; 0: none."""
+    solve_rays: int = 3_000_000
+    """Rays that these take into account, at most: pixels of all training views in equal steps."""
+    seed: int = 0
+    """Seed of the order of views and pixels, and of those that refinements are judged on."""
+    deterministic: bool = True
+    """Repeatable to the last bit on one machine, also across --resume."""
+    device: str | None = None
+    """Where to run, such as cpu or cuda; default: the best that works."""
+    evaluate_every: int = 100
+    """Iterations between glances at a few held-out views, for the curves only; 0: never."""
+    checkpoint_seconds: float = 60.0
+    """Seconds between checkpoints."""
+    motion: Motion = field(default_factory=Motion)
+    """How vertices move."""
+    exchange: Exchange = field(default_factory=lambda: Exchange(start=_START))
+    """Options of --refine exchange."""
+    grow: Grow = field(default_factory=lambda: Grow(start=_START))
+    """Options of --refine grow."""
+
+    def __post_init__(self) -> None:
+        require_declared(self, FitError, "option ")
+        for name, (least, most) in _RANGES.items():
+            value = getattr(self, name)
+            require(value is None or least <= value <= most, name, value, f"at least {least} and at most {most}")
+        for name in ("rate", "final_rate"):
+            value = getattr(self, name)
+            require(value > 0 and math.isfinite(value), name, value, "greater than 0 and finite")
+        for name in ("total_variation", "tikhonov", "checkpoint_seconds"):
+            value = getattr(self, name)
+            require(value >= 0 and math.isfinite(value), name, value, "at least 0 and finite")
+        require(all(0 <= b < 1 for b in self.betas), "betas", self.betas, "at least 0 and less than 1")
+        for name, kind in (("likelihood", Likelihood), ("refine", Refine)):
+            value = getattr(self, name)
+            require(value in get_args(kind), name, value, f"one of {', '.join(get_args(kind))}")
+
+    @property
+    def budget(self) -> int:
+        """Cells that the mesh may have, where the options do not leave it open."""
+        return self.cells or _LEAST_CELLS
+
+    def for_scan(self, capture: ProjectionCapture) -> TomographyConfig:
+        """These options with those that are left open chosen for a scan."""
+        pixels = len(capture.train_indices) * math.prod(capture.geometry.shape[1:])
+        cells = self.cells or max(_LEAST_CELLS, min(pixels // _PIXELS_PER_CELL, _MOST_CELLS))
+        return dataclasses.replace(self, cells=cells)
+
+    @property
+    def steps(self) -> int:
+        """Number of optimisation steps."""
+        return self.iterations
+
+    def strategy(self) -> Strategy | None:
+        """How the mesh is refined, in rounds between which densities can settle; None if it is not."""
+        if self.refine == "none":
+            return None
+        chosen: Exchange = getattr(self, self.refine)
+        rounds = chosen.rounds or max(1, min(_ROUNDS, self.steps // _ITERATIONS_PER_ROUND))
+        return dataclasses.replace(chosen, rounds=rounds)
+
+    def rate_at(self, iteration: int) -> float:
+        """Learning rate of a step, log-linear from ``rate`` (iteration 0) to ``final_rate`` (the last one)."""
+        fraction = iteration / max(self.steps - 1, 1)
+        return self.rate * (self.final_rate / self.rate) ** fraction
+
+    def motion_rate_at(self, iteration: int) -> float | None:
+        """Length of the vertices' steps, in altitudes; None where they stay."""
+        progress = iteration / (self.motion.until * self.steps)
+        return self.motion.rate_at(progress) if self.move and progress < 1.0 else None
+
+    def views_at(self, iteration: int, view_count: int) -> list[int]:
+        """Positions, in [0, view_count), of the training views of a step.
+
+        The views are shuffled anew in each pass over them, as a function of seed and iteration alone.
+        """
+        first = iteration * self.batch_views
+        return [self._view(k, view_count) for k in range(first, first + self.batch_views)]
+
+    def phases_at(self, iteration: int) -> np.random.Generator:
+        """Chance for which pixels a step begins with."""
+        return np.random.default_rng([self.seed, _PHASE_STREAM, iteration])
+
+    def refinement_random(self, iteration: int) -> np.random.Generator:
+        """Chance for what a refinement is judged on."""
+        return np.random.default_rng([self.seed, _REFINEMENT_STREAM, iteration])
+
+    def require_same_run(self, other: TomographyConfig) -> None:
+        """Checks that ``other`` would take the same steps as these options of a saved run, were it of the same length.
+
+        Raises:
+            FitError: An option that decides the steps differs; names the first one.
+        """
+        differing = first_difference(self, other, _FREE_OPTIONS)
+        if differing is not None:
+            name, mine, theirs = differing
+            raise FitError(
+                f"The saved run has {name} = {mine}, this run asks for {theirs}; resume with the same options or start "
+                "anew."
+            )
+
+    def to_json(self) -> dict[str, Any]:
+        """The options as JSON values."""
+        return dataclasses.asdict(self)
+
+    @staticmethod
+    def from_json(values: object) -> TomographyConfig:
+        """The inverse of :meth:`to_json`.
+
+        Raises:
+            FitError: An option is unknown, of the wrong type or out of range.
+        """
+        return options_from_json(TomographyConfig, values)
+
+    def _view(self, position: int, view_count: int) -> int:
+        epoch, offset = divmod(position, view_count)
+        return int(np.random.default_rng([self.seed, _VIEW_STREAM, epoch]).permutation(view_count)[offset])

@@ -1,0 +1,209 @@
+"""Projections where kernels see them: some or all pixels of a view, as a camera and what it measured."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+import torch
+
+from difftetvr.capture.projections.geometry import ProjectionGeometry
+from difftetvr.capture.projections.projection_capture import ProjectionCapture
+from difftetvr.mesh.field import Field
+from difftetvr.mesh.tetmesh import TetMesh
+from difftetvr.rendering import render
+from difftetvr.rendering.cameras.detector import Detector
+from difftetvr.rendering.cameras.pinhole import Camera
+
+_SQUARE = 1e-9  # cosine up to which rows and columns of a detector count as perpendicular
+_LEAST_NOISE = 1e-4  # of the greatest line integral: where noise is estimated and there is next to none
+_ROBUST = 1.4826  # of a normal distribution, the standard deviation in medians of magnitudes
+_LAPLACIAN = 6.0  # root of the sum of the squares of the second differences' weights, 1 -2 1 by 1 -2 1
+_LEAST, _SAMPLE = 1e-30, 1_000_000
+_UNIT_RAYS = 16_384
+
+
+@dataclass(frozen=True)
+class PixelSet:
+    """Pixels of one view at equal steps.
+
+    Attributes:
+        camera: What sees along their rays.
+        measured: (h, w) line integrals.
+        weight: (h, w) one over their variances; 0 where they do not count.
+    """
+
+    camera: Camera | Detector
+    measured: torch.Tensor
+    weight: torch.Tensor
+
+    @property
+    def count(self) -> int:
+        """Number of pixels."""
+        return self.measured.numel()
+
+
+class Measurements:
+    """A scan on a device.
+
+    Attributes:
+        capture: The scan.
+        device: Where its numbers are.
+        train, test: Views to learn from, and held-out ones.
+        density_unit: Mean density in the box to reconstruct, as the views show it.
+        peak: Greatest valid line integral.
+    """
+
+    def __init__(self, capture: ProjectionCapture, device: torch.device) -> None:
+        """Brings a scan to a device."""
+        self.capture, self.device = capture, device
+        self.train: list[int] = capture.train_indices.tolist()
+        self.test: list[int] = capture.test_indices.tolist()
+        self._is_before_detector = box_is_before_detector(capture.geometry)
+        self._measured = capture.line_integrals.to(device)
+        weight = 1.0 / capture.variance if capture.variance is not None else self._estimated_weight()
+        if capture.valid is not None:
+            weight = torch.where(capture.valid, weight, 0.0)
+            self._measured = torch.where(capture.valid.to(device), self._measured, 0.0)
+        self._weight = weight.to(device)
+        self.peak = float(torch.where(self._weight > 0, self._measured, -math.inf).max())
+        self.density_unit = self._mean_density()
+
+    @property
+    def all_pixels(self) -> int:
+        """Pixels of a view."""
+        return math.prod(self._measured.shape[1:])
+
+    def pixels(self, view: int, count: int, phase: tuple[float, float] = (0.5, 0.5)) -> PixelSet:
+        """About so many pixels of a view in equal steps along rows and columns; all where there are no more.
+
+        Args:
+            view: Number of the view.
+            count: How many pixels are wanted, at most.
+            phase: Where in a step of rows and of columns they begin, in [0, 1).
+        """
+        height, width = self._measured.shape[1:]
+        down, across = steps_for(height, width, count)
+        first = (min(int(phase[0] * down), height - 1), min(int(phase[1] * across), width - 1))
+        measured, weight = (part[view, first[0] :: down, first[1] :: across] for part in (self._measured, self._weight))
+        detector = strided(self.capture.geometry.view(view), first, (down, across), tuple(measured.shape))
+        if not self._is_before_detector:
+            return PixelSet(detector, measured, weight)
+        if (camera := as_camera(detector)) is not None:
+            return PixelSet(camera, measured, weight)
+        mirrored = as_camera(dataclasses.replace(detector, columns=-detector.columns))
+        if mirrored is not None:
+            return PixelSet(mirrored, measured.flip(1), weight.flip(1))
+        return PixelSet(detector, measured, weight)
+
+    def _estimated_weight(self) -> torch.Tensor:
+        """(V, H, W) one over the variance of noise that is the same everywhere, by second differences (Immerkaer 1996).
+
+        What they leave of the object itself is at edges; the median passes over these.
+        """
+        values, valid = self.capture.line_integrals, self.capture.valid
+        if valid is not None:
+            values = torch.where(valid, values, torch.nan)
+        largest = float(values.abs().nan_to_num(0.0).max())
+        if min(values.shape[1:]) >= 3:
+            rows = values[:, :-2] - 2.0 * values[:, 1:-1] + values[:, 2:]
+            differences, scale = rows[..., :-2] - 2.0 * rows[..., 1:-1] + rows[..., 2:], _LAPLACIAN
+        elif values.shape[2] >= 3:
+            differences, scale = values[..., :-2] - 2.0 * values[..., 1:-1] + values[..., 2:], math.sqrt(_LAPLACIAN)
+        else:
+            return torch.full_like(values, 1.0 / max(largest, _LEAST) ** 2)
+        known = differences[torch.isfinite(differences)]
+        sample = known[:: max(1, len(known) // _SAMPLE)].abs()
+        noise = _ROBUST * float(sample.median()) / scale if len(sample) else 0.0
+        noise = max(noise, _LEAST_NOISE * largest, _LEAST)
+        return torch.full_like(values, 1.0 / noise**2)
+
+    def _mean_density(self) -> float:
+        """Sum of all line integrals over that of the rays' ways through the box."""
+        low, high = self.capture.geometry.bounds.tolist()
+        box = TetMesh.grid((1, 1, 1), low, high)
+        ones = torch.ones(box.num_vertices)
+        seen = way = 0.0
+        for view in self.train:
+            part = self.pixels(view, _UNIT_RAYS // max(1, len(self.train)) + 64)
+            length = render(box, Field(ones.new_zeros(len(ones), 0), ones), part.camera).optical_depth
+            counts = (part.weight.cpu() > 0) & (length > 0)
+            seen += float(part.measured.cpu()[counts].double().sum())
+            way += float(length[counts].double().sum())
+        mean = seen / way if way > 0 else 0.0
+        if mean > 0:
+            return mean
+        sides = [b - a for a, b in zip(low, high, strict=True)]
+        return max(self.peak, _LEAST) / max(sides)
+
+
+def steps_for(height: int, width: int, count: int) -> tuple[int, int]:
+    """Steps down and across an image of which about so many pixels are taken, at most; equal as far as it goes."""
+    if height * width <= count:
+        return 1, 1
+    down = min(height, max(1, round(math.sqrt(height * width / count))))
+    rows = -(-height // down)
+    return down, max(1, math.ceil(width * rows / max(count, 1)))
+
+
+def strided(detector: Detector, first: tuple[int, int], steps: tuple[int, int], shape: tuple[int, ...]) -> Detector:
+    """The detector of one view that has every so many pixels, with the same rays.
+
+    Args:
+        detector: The detector.
+        first: Row and column of the first pixel.
+        steps: Pixels down and across from one to the next.
+        shape: How many there are, down and across.
+    """
+    if steps == (1, 1):
+        return detector
+    offsets = [
+        start + 0.5 * (step * (count - 1) + 1 - size)
+        for start, step, count, size in zip(first, steps, shape, (detector.height, detector.width), strict=True)
+    ]
+    return dataclasses.replace(
+        detector,
+        center=detector.center + offsets[0] * detector.rows + offsets[1] * detector.columns,
+        rows=steps[0] * detector.rows,
+        columns=steps[1] * detector.columns,
+        height=shape[0],
+        width=shape[1],
+    )
+
+
+def as_camera(detector: Detector) -> Camera | None:
+    """The pinhole camera that sees along the rays of a detector with a source, whose entries are found faster.
+
+    None where there is no such camera: for parallel rays, and where the detector is seen mirrored or its sides are not
+    perpendicular. Nothing of the object may lie behind the detector.
+    """
+    if detector.source is None:
+        return None
+    across, down = detector.columns.norm(), detector.rows.norm()
+    right, below = detector.columns / across, detector.rows / down
+    forward = torch.linalg.cross(right, below)
+    to_center = detector.center - detector.source
+    distance = float(to_center @ forward)
+    if abs(float(right @ below)) > _SQUARE or distance <= 0:
+        return None
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = torch.stack((right, below, forward))
+    pose[:3, 3] = -pose[:3, :3] @ detector.source
+    fx, fy = distance / float(across), distance / float(down)
+    cx = 0.5 * detector.width - float(to_center @ right) / float(across)
+    cy = 0.5 * detector.height - float(to_center @ below) / float(down)
+    return Camera(pose, fx, fy, cx, cy, detector.width, detector.height)
+
+
+def box_is_before_detector(geometry: ProjectionGeometry) -> bool:
+    """Whether in all views the box to reconstruct lies on the source's side of the detector."""
+    low, high = geometry.bounds
+    detector = geometry.detector
+    if detector.source is None:
+        return True
+    corners = torch.cartesian_prod(*torch.stack((low, high)).T)
+    normal = torch.linalg.cross(detector.columns, detector.rows)
+    side = torch.sign(((detector.center - detector.source) * normal).sum(-1))
+    heights = ((corners[None] - detector.center[:, None]) * normal[:, None]).sum(-1) * side[:, None]
+    return bool((heights <= 0).all())

@@ -1,0 +1,304 @@
+"""One tomographic reconstruction between two iterations, and what an iteration does."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import torch
+
+from difftetvr.capture.free_space import FreeSpace
+from difftetvr.capture.projections.projection_capture import ProjectionCapture
+from difftetvr.errors import FitError
+from difftetvr.fitting.beginning.requirements import resolve_device
+from difftetvr.fitting.positions import VertexOptimizer
+from difftetvr.fitting.processes import ALONE
+from difftetvr.fitting.records.checkpoint import Checkpoint
+from difftetvr.fitting.records.history import History, RefinementRecord
+from difftetvr.fitting.records.result import Progress
+from difftetvr.fitting.records.unread import Unread
+from difftetvr.fitting.refinement import Moment, Refinement, Situation, Strategy
+from difftetvr.inverse.tomography.config import TomographyConfig
+from difftetvr.inverse.tomography.densities import Densities
+from difftetvr.inverse.tomography.judgement import Judgement
+from difftetvr.inverse.tomography.likelihoods import LIKELIHOODS
+from difftetvr.inverse.tomography.measurements import Measurements, PixelSet
+from difftetvr.inverse.tomography.objective import Objective
+from difftetvr.inverse.tomography.scoring import ProjectionScore, score_views
+from difftetvr.inverse.tomography.solver import solve
+from difftetvr.mesh.making.generators import grid_cubes
+from difftetvr.mesh.tetmesh import TetMesh
+from difftetvr.rendering import render
+from difftetvr.rendering.gauss_newton import ImageModel
+
+_GLANCE_VIEWS, _GLANCED_RAYS = 4, 16_384
+_PENALTY_EVERY = 4
+"""Iterations that share one evaluation of the penalty, which costs as much as some ten thousand rays."""
+_POSITIONS = "positions."  # prefix of the positions' state in a checkpoint
+
+
+class Reconstruction:
+    """A reconstruction between two iterations; its state alone decides how it goes on.
+
+    Attributes:
+        measurements: The scan.
+        config: Options.
+        densities: Densities under optimisation.
+        positions: Vertex positions under optimisation; None where they are fixed.
+        iteration: Iterations done.
+        history: What happened so far; PSNR is that of line integrals, with the greatest of the scan as peak.
+        processes: This one alone.
+    """
+
+    def __init__(self, capture: ProjectionCapture, config: TomographyConfig, mesh: TetMesh | None = None) -> None:
+        """Prepares the first iteration.
+
+        Args:
+            capture: The scan.
+            config: Options.
+            mesh: Mesh to begin with; default: a grid over the box to reconstruct.
+
+        Raises:
+            FitError: The device does not exist.
+            MeshError: The mesh would be too large.
+        """
+        device = resolve_device(config.device)
+        self.config, self.strategy, self.processes = config, config.strategy(), ALONE
+        self.measurements = Measurements(capture, device)
+        self._mesh = (mesh or _grid(capture, config, self.strategy)).to(device=device)
+        self.positions = VertexOptimizer(self._mesh, config.motion) if config.move else None
+        self.densities = Densities(self._mesh, self.measurements.density_unit, config.rate, config.betas)
+        self.objective = Objective.of(config, float((capture.geometry.bounds[1] - capture.geometry.bounds[0]).prod()))
+        self.budget = max(config.budget, self._mesh.num_cells if mesh is not None else 0)
+        self.iteration, self.history = 0, History()
+        self._unread = Unread()
+        self._description = _describe(capture)
+
+    @property
+    def mesh(self) -> TetMesh:
+        """The mesh as it is now, detached."""
+        mesh = self.positions.mesh if self.positions else self._mesh
+        return mesh.with_vertices(mesh.vertices.detach())
+
+    def step(self) -> None:
+        """One iteration: refines the mesh where that is due, looks along rays, moves densities and vertices.
+
+        Raises:
+            FitError: The loss is not finite.
+        """
+        self._refine_if_due()
+        config = self.config
+        rate = config.motion_rate_at(self.iteration)
+        mesh = self.positions.mesh if self.positions and rate is not None else self.mesh
+        self._unread.add(self.iteration, *self._gather(mesh))
+        self._unread.read_errors(self.history)
+        self.densities.step(config.rate_at(self.iteration))
+        self._move(rate)
+        self.iteration += 1
+
+    def solve(self, on_step: Callable[[int], None] | None = None) -> None:
+        """Solves for the densities with pixels of all training views, while the vertices stay.
+
+        Args:
+            on_step: Called with the number of steps done.
+        """
+        scan = self.measurements
+        each = max(1, self.config.solve_rays // max(1, len(scan.train)))
+        found = solve(
+            self.mesh,
+            self.densities.values,
+            self.densities.unit,
+            lambda: (scan.pixels(view, each) for view in scan.train),
+            self.objective,
+            self.config.solve_steps,
+            on_step,
+        )
+        self.densities.set(found.values)
+
+    def glance(self) -> None:
+        """Notes the PSNR of line integrals of a few held-out views, for the curves; decides nothing."""
+        views = self.measurements.test
+        views = views[:: max(1, math.ceil(len(views) / _GLANCE_VIEWS))]
+        if views:
+            score = self.score(views, _GLANCED_RAYS)
+            self.history.evaluations.append((self.iteration, score.mean_psnr))
+
+    def score(self, views: list[int], pixels: int | None = None) -> ProjectionScore:
+        """How well views are predicted.
+
+        Args:
+            views: Their numbers.
+            pixels: Pixels of each to look at, at most; default: all.
+        """
+        return score_views(self.mesh, self.densities.detached(), self.measurements, views, pixels)
+
+    def progress(self, seconds: float) -> Progress:
+        """A summary for a display; loss and PSNR are means over the last pass through the training views."""
+        window, history = self._epoch, self.history
+        losses, psnrs = history.loss[-window:], history.psnr[-window:]
+        return Progress(
+            iteration=self.iteration,
+            iterations=self.config.steps,
+            loss=sum(losses) / max(1, len(losses)),
+            train_psnr=sum(psnrs) / max(1, len(psnrs)),
+            held_out_psnr=history.evaluations[-1][1] if history.evaluations else None,
+            cells=self.mesh.num_cells,
+            moves=history.moves,
+            refinements=len(history.refinements),
+            last_refinement=history.refinements[-1] if history.refinements else None,
+            seconds=seconds,
+        )
+
+    def checkpoint(self) -> Checkpoint:
+        """The state, to be saved."""
+        self._unread.read_moves(self.history)
+        tensors = {"vertices": self.mesh.vertices, "tets": self.mesh.tets, **self.densities.state()}
+        if self.positions:
+            state = self.positions.state()
+            tensors |= {_POSITIONS + name: tensor for name, tensor in state.items() if name != "vertices"}
+        strategy = type(self.strategy).__name__
+        return Checkpoint(self.iteration, self.config, self._description, tensors, self.budget, strategy, self.history)
+
+    @staticmethod
+    def resume(capture: ProjectionCapture, config: TomographyConfig, checkpoint: Checkpoint) -> Reconstruction:
+        """Goes on from a checkpoint.
+
+        Raises:
+            FitError: The checkpoint is of a run with other options or another scan, lacks something, or has come
+                further than the options ask for.
+        """
+        checkpoint.config.require_same_run(config)
+        checkpoint.require_not_beyond(config.steps)
+        run = Reconstruction(capture, config, checkpoint.mesh())
+        for name, value in run._description.items():
+            if checkpoint.capture.get(name) != value:
+                raise FitError(
+                    f"The saved run used a scan with {name} = {checkpoint.capture.get(name)}, this one has {value}; "
+                    "resume with the same scan or start anew."
+                )
+        checkpoint.require_tensors_like(run.checkpoint().tensors)
+        run.densities.restore(checkpoint.tensors)
+        if run.positions:
+            state = {k.removeprefix(_POSITIONS): v for k, v in checkpoint.tensors.items()}
+            run.positions.restore(state)
+        run.budget, run.iteration, run.history = checkpoint.budget, checkpoint.iteration, checkpoint.history
+        return run
+
+    @property
+    def _epoch(self) -> int:
+        """Iterations of one pass over the training views."""
+        return max(1, len(self.measurements.train) // self.config.batch_views)
+
+    def _gather(self, mesh: TetMesh) -> tuple[torch.Tensor, torch.Tensor]:
+        """Gradients of the objective over some pixels; means of the loss and of the squared error."""
+        config, scan = self.config, self.measurements
+        self.densities.zero_grad()
+        random = config.phases_at(self.iteration)
+        views = [scan.train[k] for k in config.views_at(self.iteration, len(scan.train))]
+        each = max(1, config.rays // len(views))
+        parts = [scan.pixels(view, each, (float(random.random()), float(random.random()))) for view in views]
+        count = max(1, sum(int((part.weight > 0).sum()) for part in parts))
+        loss = error = torch.zeros((), dtype=torch.float64, device=scan.device)
+        for part in parts:
+            found = self._integrals(mesh, part)
+            residuals = LIKELIHOODS[config.likelihood](found.detach(), part.measured, part.weight)
+            counts = part.weight > 0
+            found.backward(torch.where(counts, residuals.slope, 0.0) / count)
+            loss = loss + torch.where(counts, residuals.loss, 0.0).sum(dtype=torch.float64) / count
+            squares = torch.where(counts, (found.detach() - part.measured).square(), 0.0)
+            error = error + squares.sum(dtype=torch.float64) / count
+        if self.iteration % _PENALTY_EVERY == 0:
+            self._penalise(mesh)
+        return loss, error / scan.peak**2
+
+    def _penalise(self, mesh: TetMesh) -> None:
+        """Adds the penalty's derivatives, those of as many iterations as share them."""
+        densities = self.densities
+        penalty = self.objective.penalty(mesh, densities.detached(), densities.unit)
+        if penalty.by_density is not None and densities.values.grad is not None:
+            densities.values.grad += (_PENALTY_EVERY * densities.unit * penalty.by_density).to(densities.values)
+        if penalty.by_vertex is not None and mesh.vertices.grad is not None:
+            mesh.vertices.grad += (_PENALTY_EVERY * penalty.by_vertex).to(mesh.vertices)
+
+    def _integrals(self, mesh: TetMesh, part: PixelSet) -> torch.Tensor:
+        image = render(mesh, self.densities.field(), part.camera, deterministic=self.config.deterministic)
+        return image.optical_depth
+
+    def _move(self, rate: float | None) -> None:
+        if self.positions is None:
+            return
+        if rate is None:
+            self.positions.zero_grad()
+        elif (self.iteration + 1) % self.config.motion.every == 0:
+            self._unread.add_moves(self.positions.advance(rate))
+            self._unread.read_moves(self.history)
+
+    def _moment(self) -> Moment:
+        return Moment(self.iteration, self.config.steps, self._epoch, self.mesh.num_cells, self.budget)
+
+    def _refine_if_due(self) -> None:
+        if self.strategy is None or not self.strategy.is_due(self._moment()):
+            return
+        mesh, densities = self.mesh, self.densities
+        judgement = Judgement.of(self.measurements, self.config, self.iteration, self.strategy.views, mesh)
+
+        def model(steps: torch.Tensor | None) -> ImageModel:
+            return judgement.model(mesh, densities.detached(), densities.unit, steps)
+
+        values = torch.nn.functional.pad(densities.values.detach()[:, None], (3, 0))
+        # Nothing is known to be empty, and there are no colours.
+        situation = Situation(mesh, values, self._moment(), model, _no_colors, FreeSpace([], []))
+        refinement = self.strategy.refine(situation)
+        if refinement is None:
+            return
+        judges = judgement.some()
+        before = judges.error(mesh, densities.detached())
+        self._apply(refinement)
+        self.history.refinements.append(
+            RefinementRecord(
+                iteration=self.iteration,
+                cells_before=mesh.num_cells,
+                cells=self.mesh.num_cells,
+                vertices=self.mesh.num_vertices,
+                removed=refinement.removed,
+                added=refinement.added,
+                flipped=refinement.flipped,
+                predicted=refinement.predicted,
+                error_before=before,
+                error_after=judges.error(self.mesh, densities.detached()),
+            )
+        )
+
+    def _apply(self, refinement: Refinement) -> None:
+        for change in refinement.changes:
+            self.densities.carry(change)
+            if self.positions:
+                self.positions.carry(change)
+            self._mesh = change.mesh
+        if refinement.surplus is not None:
+            self.densities.set(self.densities.values.detach() + refinement.surplus[:, 3].to(self.densities.values))
+
+
+def _no_colors() -> torch.Tensor:
+    raise FitError("A tomographic reconstruction has no colours to refine by; refine by exchange or grow.")
+
+
+def _grid(capture: ProjectionCapture, config: TomographyConfig, strategy: Strategy | None) -> TetMesh:
+    """The grid of near-cubic cubes over the box to reconstruct."""
+    low, high = capture.geometry.bounds.tolist()
+    cells = strategy.initial_cells(config.budget) if strategy else config.budget
+    sides = [b - a for a, b in zip(low, high, strict=True)]
+    return TetMesh.grid(grid_cubes(cells, sides), low, high)
+
+
+def _describe(capture: ProjectionCapture) -> dict[str, Any]:
+    """What tells one scan from another: values that are compared when a run is resumed."""
+    views, height, width = capture.geometry.shape
+    return {
+        "views": views,
+        "height": height,
+        "width": width,
+        "test_views": capture.test_indices.tolist(),
+        "mean": float(capture.line_integrals.mean(dtype=torch.float64)),
+    }
