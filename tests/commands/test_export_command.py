@@ -303,7 +303,7 @@ def test_fields_on_cells(tmp_path, capsys):
     ("args", "sentence"),
     [
         (["g.nrrd", "--level", "1"], "--level is for a surface (.ply, .glb, .vtp, .obj, .stl), which "),
-        (["g.ply", "--samples", "2"], "--samples is for a grid (.nrrd, .vti, .npy), which "),
+        (["g.ply", "--samples", "2"], "--samples is for a grid (.nrrd, .vti, .nii, .npy), which "),
         (["g.vtu", "--outside", "nan"], "--outside is for a grid"),
         (["g.vtu", "--scalar", "T"], "--scalar is for a grid or a surface"),
         (["g.vti", "--geometry"], "--geometry is for a mesh"),

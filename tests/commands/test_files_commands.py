@@ -77,7 +77,7 @@ def test_export_says_what_is_left_out(tmp_path, flat_mesh, capsys):
     assert "(1 cell, geometry only, without color, density, heat, pressure)" in output
     sentence = fails(capsys, "export", flat_mesh, tmp_path / "a.off")
     assert "'.off' is no format that is written; write a mesh (.vtu, " in sentence
-    assert "or a grid (.nrrd, .vti, .npy), or a surface (.ply, " in sentence
+    assert "or a grid (.nrrd, .vti, .nii, .npy), or a surface (.ply, " in sentence
     hexahedron = tmp_path / "a.vtk"
     hexahedron.write_text(HEXAHEDRON)
     assert "1 cell of type 'hexahedron'; only linear" in fails(capsys, "export", hexahedron, tmp_path / "b.vtu")

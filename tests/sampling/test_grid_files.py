@@ -213,7 +213,7 @@ def test_too_little_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"path": "v.mha"}, r"no file of values on a grid; use one of .nrrd, .vti, .npy"),
+        ({"path": "v.mha"}, r"no file of values on a grid; use one of .nrrd, .vti, .nii, .npy"),
         ({"path": "nowhere/v.npy"}, "create the folder first"),
         (
             {"values": {"a": torch.rand(60), "b": torch.rand(60)}},

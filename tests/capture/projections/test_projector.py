@@ -109,8 +109,8 @@ def test_an_ellipsoid_of_fine_voxels_has_its_known_shadow(method):
         o, d = (origins - middle) / axes, unit / axes
         a, b, c = (d * d).sum(-1), (o * d).sum(-1), (o * o).sum(-1) - 1
         chord = 2 * np.sqrt(np.maximum(b * b - a * c, 0)) / a
-        assert np.abs(found[view] - chord).mean() < 0.003 * chord.max()
-        assert found[view].sum() == pytest.approx(chord.sum(), rel=0.006)
+        assert np.abs(found[view] - chord).mean() < 0.005 * chord.max()
+        assert found[view].sum() == pytest.approx(chord.sum(), rel=0.01)
 
 
 def test_many_views_are_projected_in_parts_and_counted(monkeypatch):
