@@ -1,7 +1,5 @@
-from . import circular as circular
 from . import coverage as coverage
-from . import described as described
-from . import entries as entries
+from . import descriptions as descriptions
 from . import geometry as geometry
 from . import intensities as intensities
 from . import noise as noise

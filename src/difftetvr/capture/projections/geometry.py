@@ -13,10 +13,10 @@ import numpy as np
 import torch
 
 from difftetvr.capture.projections.coverage import require_sight
-from difftetvr.capture.projections.described import Parts, described, parse_described
-from difftetvr.capture.projections.entries import read_json
-from difftetvr.capture.projections.readers.astra import is_astra, parse_astra
-from difftetvr.capture.projections.readers.tigre import is_tigre, parse_tigre
+from difftetvr.capture.projections.descriptions.astra import is_astra, parse_astra
+from difftetvr.capture.projections.descriptions.described import Parts, described, parse_described
+from difftetvr.capture.projections.descriptions.entries import read_json
+from difftetvr.capture.projections.descriptions.tigre import is_tigre, parse_tigre
 from difftetvr.errors import CaptureError, counted, shown
 from difftetvr.inputs import as_reals, require_type
 from difftetvr.rendering.cameras.detector import Detector

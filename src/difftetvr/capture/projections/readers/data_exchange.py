@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from difftetvr.capture.projections.circular import Circular
-from difftetvr.capture.projections.described import Parts
+from difftetvr.capture.projections.descriptions.circular import Circular
+from difftetvr.capture.projections.descriptions.described import Parts
 from difftetvr.capture.projections.geometry import geometry_of
 from difftetvr.capture.projections.raw_scan import RawScan, ScanOptions, require_room
 from difftetvr.errors import CaptureError

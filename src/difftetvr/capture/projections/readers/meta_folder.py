@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 
 from difftetvr.archive import read_array
-from difftetvr.capture.projections.described import Parts
-from difftetvr.capture.projections.entries import Entries, read_json
+from difftetvr.capture.projections.descriptions.described import Parts
+from difftetvr.capture.projections.descriptions.entries import Entries, read_json
+from difftetvr.capture.projections.descriptions.tigre import scan_of
 from difftetvr.capture.projections.geometry import geometry_of
 from difftetvr.capture.projections.noise import log_variance
 from difftetvr.capture.projections.raw_scan import RawScan, ScanOptions, require_room
-from difftetvr.capture.projections.readers.tigre import scan_of
 from difftetvr.errors import CaptureError, shown
 from difftetvr.trust import file_beside
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from difftetvr.archive import read_arrays
-from difftetvr.capture.projections.entries import parse_json
+from difftetvr.capture.projections.descriptions.entries import parse_json
 from difftetvr.capture.projections.geometry import geometry_of, parse_parts
 from difftetvr.capture.projections.raw_scan import RawScan, ScanOptions, as_capture_errors, require_room
 from difftetvr.errors import CaptureError

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from difftetvr.capture.projections.circular import Circular
-from difftetvr.capture.projections.entries import Entries
+from difftetvr.capture.projections.descriptions.circular import Circular
+from difftetvr.capture.projections.descriptions.entries import Entries
 from difftetvr.errors import CaptureError
 from difftetvr.rendering.cameras.detector import Detector
 

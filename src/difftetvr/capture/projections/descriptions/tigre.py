@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from difftetvr.capture.projections.circular import Circular
-from difftetvr.capture.projections.described import Parts
-from difftetvr.capture.projections.entries import Entries, as_numbers
+from difftetvr.capture.projections.descriptions.circular import Circular
+from difftetvr.capture.projections.descriptions.described import Parts
+from difftetvr.capture.projections.descriptions.entries import Entries, as_numbers
 from difftetvr.errors import CaptureError
 
 Floats = NDArray[np.float64]

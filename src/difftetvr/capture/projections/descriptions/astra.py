@@ -15,9 +15,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from difftetvr.capture.projections.circular import Circular
-from difftetvr.capture.projections.described import Parts, bounds_of
-from difftetvr.capture.projections.entries import Entries
+from difftetvr.capture.projections.descriptions.circular import Circular
+from difftetvr.capture.projections.descriptions.described import Parts, bounds_of
+from difftetvr.capture.projections.descriptions.entries import Entries
 from difftetvr.errors import CaptureError
 from difftetvr.rendering.cameras.detector import Detector
 
