@@ -16,6 +16,7 @@ from difftetvr.backend import Backend
 NUMBERS_OF_VIEW = 18
 """Of origin and direction of a ray: at the middle of the first pixel, and what a column and a row add to each."""
 
+_STILL = 1e-20  # of a direction's length
 _GAUSS = 0.28867513459481287  # half of 1 / sqrt(3): two such points integrate cubic polynomials exactly
 
 
@@ -51,12 +52,16 @@ class VoxelRays:
     Attributes:
         origin: Three coordinates.
         direction: Three, in voxels per unit of length.
+        inverse: Three, their inverses; 0 where a ray does not move along an axis.
+        begin: Three, -origin times these, or infinity: planes w are at the parameters w inverse + begin.
         near: Where a ray enters the box, or begins.
         far: Where it leaves it, or ends; at most ``near`` where it misses.
     """
 
     origin: tuple[Any, Any, Any]
     direction: tuple[Any, Any, Any]
+    inverse: tuple[Any, Any, Any]
+    begin: tuple[Any, Any, Any]
     near: Any
     far: Any
 
@@ -84,15 +89,19 @@ def rays_of(b: Backend, voxels: Voxels, view: list[Any], pixel: tuple[Any, Any],
     shift = dr.fma(offset[0], direction[0], dr.fma(offset[1], direction[1], offset[2] * direction[2])) / squared
     origin = [dr.fma(direction[a], shift, origin[a]) for a in range(3)]
     near, far = dr.fma(ends[0], length, -shift), dr.fma(ends[1], length, -shift)
+    size = dr.sqrt(squared)
+    inverse, begin = [], []
     for axis in range(3):
-        inverse = 1.0 / direction[axis]
-        lower, upper = (voxels.lower - origin[axis]) * inverse, (voxels.upper[axis] - origin[axis]) * inverse
-        still = direction[axis] == 0.0
+        # So slow along an axis, a ray crosses none of its planes: they are at infinity.
+        still = dr.abs(direction[axis]) <= _STILL * size
+        inverse.append(dr.select(still, 0.0, 1.0 / direction[axis]))
+        begin.append(dr.select(still, dr.inf, -origin[axis] * inverse[axis]))
+        lower, upper = (dr.fma(side, inverse[axis], begin[axis]) for side in (voxels.lower, voxels.upper[axis]))
         between = (origin[axis] >= voxels.lower) & (origin[axis] < voxels.upper[axis])
         enter, leave = dr.select(lower < upper, lower, upper), dr.select(lower < upper, upper, lower)
         near = dr.fmax(near, dr.select(still, dr.select(between, -dr.inf, dr.inf), enter))
         far = dr.fmin(far, dr.select(still, dr.select(between, dr.inf, -dr.inf), leave))
-    return VoxelRays(_three(origin), _three(direction), near, far)
+    return VoxelRays(_three(origin), _three(direction), _three(inverse), _three(begin), near, far)
 
 
 def integrate(b: Backend, voxels: Voxels, rays: VoxelRays, linear: bool) -> Any:
@@ -107,7 +116,6 @@ def integrate(b: Backend, voxels: Voxels, rays: VoxelRays, linear: bool) -> Any:
     """
     hit = rays.near < rays.far
     start = dr.select(hit, rays.near, 0.0)
-    inverse = [1.0 / part for part in rays.direction]
     planes, cells, ahead = [], [], []
     for axis in range(3):
         forward = rays.direction[axis] > 0.0
@@ -117,17 +125,16 @@ def integrate(b: Backend, voxels: Voxels, rays: VoxelRays, linear: bool) -> Any:
         cells.append(b.Int(cell - voxels.first))
         ahead.append(forward)
     index = b.UInt(cells[0]) + voxels.strides[0] * b.UInt(cells[1]) + voxels.strides[1] * b.UInt(cells[2])
-    steps = (b.UInt(1), voxels.strides[0], voxels.strides[1])
+    strides = (b.UInt(1), voxels.strides[0], voxels.strides[1])
+    steps = [dr.select(on, by, b.UInt(0) - by) for on, by in zip(ahead, strides)]
+    signs = [dr.select(on, b.Float(1), b.Float(-1)) for on in ahead]
 
     def running(t: Any, *state: Any) -> Any:
         return hit & (t < rays.far)
 
     def advance(t: Any, total: Any, index: Any, x: Any, y: Any, z: Any) -> tuple[Any, ...]:
         walls = [x, y, z]
-        times = []
-        for axis in range(3):
-            time = (walls[axis] - rays.origin[axis]) * inverse[axis]
-            times.append(dr.select(rays.direction[axis] == 0.0, dr.inf, time))
+        times = [dr.fma(walls[axis], rays.inverse[axis], rays.begin[axis]) for axis in range(3)]
         first = dr.fmin(times[0], dr.fmin(times[1], times[2]))
         end = dr.fmax(t, dr.fmin(first, rays.far))
         mean = (
@@ -140,9 +147,8 @@ def integrate(b: Backend, voxels: Voxels, rays: VoxelRays, linear: bool) -> Any:
         left = first < rays.far  # else the ray ends here, and there need not be a next one
         for axis in range(3):
             moves = crossed[axis] & left
-            walls[axis] = dr.select(moves, walls[axis] + dr.select(ahead[axis], 1.0, -1.0), walls[axis])
-            step = dr.select(ahead[axis], steps[axis], b.UInt(0) - steps[axis])
-            index = dr.select(moves, index + step, index)
+            walls[axis] = dr.select(moves, walls[axis] + signs[axis], walls[axis])
+            index = dr.select(moves, index + steps[axis], index)
         return dr.select(left, end, rays.far), total, index, walls[0], walls[1], walls[2]
 
     state = (start, b.Float(0), index, planes[0], planes[1], planes[2])
