@@ -53,6 +53,8 @@ READERS: dict[str, Callable[[Path], object]] = {
     "strict mesh": strict_mesh,
     "capture": dtv.load_capture,
     "volume": dtv.Volume.load,
+    "scan": dtv.capture.ProjectionCapture.load,
+    "geometry": dtv.capture.ProjectionGeometry.load,
     "transfer function": dtv.TransferFunction.load,
     "points": load_points,
     "surface": load_surface,

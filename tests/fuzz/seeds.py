@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import json
 import shutil
 import warnings
 from collections.abc import Callable
@@ -10,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import h5py
 import meshio
 import nibabel
 import numpy as np
@@ -169,7 +171,7 @@ def _written_by_meshio(folder: Path, mesh: TetMesh, name: str, file_format: str,
 def write_seeds(folder: Path) -> list[Seed]:
     """All intact inputs, below a folder."""
     folder.mkdir(parents=True)
-    makers: list[Callable[[Path], list[Seed]]] = [_meshes, _volumes, _photos, _saved, _others]
+    makers: list[Callable[[Path], list[Seed]]] = [_meshes, _volumes, _photos, _saved, _others, _projections]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return [seed for make in makers for seed in make(folder)]
@@ -302,3 +304,35 @@ _FUNCTION = """<TransferFunction><OpacityPoints><OpacityPoint position="0" opaci
 <ColorPoint position="0" r="0" g="0" b="0"/><ColorPoint position="1" r="255" g="0" b="9"/></ColorPoints>
 </TransferFunction>
 """
+
+
+def _projections(folder: Path) -> list[Seed]:
+    """Scans of all kinds, and geometries of all dialects."""
+    own = folder / "projections"
+    own.mkdir()
+    values = np.random.default_rng(0).random((3, 4, 5)).astype(np.float32)
+    cone = {"type": "cone", "views": 3, "source_distance": 5, "detector_distance": 7, "detector": [5, 4]}
+    cone |= {"detector_size": [3, 3], "volume_size": 2}
+    geometry = dtv.capture.ProjectionGeometry.from_dict(cone)
+    scan = dtv.capture.ProjectionCapture(geometry, torch.from_numpy(values), torch.from_numpy(values) + 1)
+    scan.save(own / "a.npz")
+    scan.save(own / "b.h5")
+    np.savez_compressed(own / "c.npz", geometry=json.dumps(cone), intensities=values + 1, flat=2.0)
+    with h5py.File(own / "d.h5", "w") as file:
+        file["exchange/data"], file["exchange/data_white"] = values + 1, np.full((2, 4, 5), 2.0)
+        file["exchange/theta"] = np.array([0.0, 60, 120])
+    np.save(own / "e.npy", values)
+    tigre = {"DSD": 7, "DSO": 5, "nDetector": [4, 5], "sDetector": [3, 3], "sVoxel": [2, 2, 2], "angles": [0, 1, 2]}
+    (own / "e.json").write_text(json.dumps(tigre))
+    turning = {"type": "parallel3d", "DetectorSpacingX": 1, "DetectorSpacingY": 1, "DetectorColCount": 5}
+    turning |= {"DetectorRowCount": 4, "ProjectionAngles": [0, 1, 2]}
+    (own / "f.json").write_text(json.dumps({"proj_geom": turning}))
+    (own / "g.json").write_text(json.dumps(geometry.to_dict()))
+    views = [{"file_path": f"{k}.npy", "angle": float(k)} for k in range(3)]
+    for view, projection in zip(views, values):
+        np.save(own / view["file_path"], projection)
+    meta = {"scanner": tigre | {"mode": "cone"}, "proj_train": views[:2], "proj_test": views[2:]}
+    (own / "meta_data.json").write_text(json.dumps(meta))
+    files = {"a.npz": (), "b.h5": (), "c.npz": (), "d.h5": (), "e.npy": ("e.json",), "meta_data.json": ("0.npy",)}
+    seeds = [Seed("scan", own, name, (name, *others)) for name, others in files.items()]
+    return seeds + [Seed("geometry", own, name, (name,)) for name in ("e.json", "f.json", "g.json")]

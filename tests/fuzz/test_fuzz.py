@@ -24,5 +24,5 @@ def test_damaged_inputs_give_content_or_a_sentence():
     assert done.returncode == 0, done.stdout + done.stderr
     for suffix in MESHES:
         assert f"mesh {suffix} " in done.stdout
-    for kind in ("capture", "volume", "transfer function", "points"):
+    for kind in ("capture", "volume", "scan", "geometry", "transfer function", "points"):
         assert f"\n{kind} " in done.stdout

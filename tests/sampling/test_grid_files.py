@@ -6,6 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
+import nibabel
 import numpy as np
 import pytest
 import SimpleITK
@@ -253,3 +254,35 @@ def test_mistakes_about_values_that_are_there(tmp_path: Path, values: Any, messa
     with pytest.raises(MeshError, match=message) as error:
         save_grid(tmp_path / "v.vti", values, GRID)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("grid", [GRID, TURNED])
+def test_nifti_files_have_the_places_and_the_vectors_of_the_grid(tmp_path: Path, mesh: TetMesh, grid: Grid) -> None:
+    vectors = mesh.vertices.new_tensor(np.random.default_rng(0).random((mesh.num_vertices, 3)))
+    for name, values in (("scalars", vectors[:, 0]), ("vectors", vectors)):
+        voxelise_to_file(tmp_path / f"{name}.nii", mesh, values, grid)
+        image = nibabel.load(tmp_path / f"{name}.nii")
+        found = np.asarray(image.dataobj)
+        expected = sampled(mesh, values, grid)
+        np.testing.assert_array_equal(found if name == "scalars" else found[:, :, :, 0], expected)
+        assert found.dtype == expected.dtype and image.header["intent_code"] == (0 if name == "scalars" else 1007)
+        signs = np.array([-1, -1, 1]) if grid.space else np.ones(3)
+        axes = np.eye(3) if grid.directions is None else np.array(grid.directions)
+        index = np.array([2, 3, 1])
+        place = signs * (np.array(grid.origin) + (index * np.array(grid.spacing)) @ axes)
+        np.testing.assert_allclose(nibabel.affines.apply_affine(image.affine, index), place, atol=1e-6)
+        assert image.header.get_xyzt_units()[0] == (grid.unit or "unknown")
+    # And our own reader puts them where they were.
+    placement = Placement.of(tmp_path / "scalars.nii")
+    assert placement.shape == grid.shape and placement.world.unit == grid.unit
+
+
+def test_arrays_may_have_x_first(tmp_path: Path) -> None:
+    mesh = bent_mesh()
+    values = mesh.vertices.clone()
+    for name, table in (("scalars", values[:, 0]), ("vectors", values)):
+        arrays = {name: slabs_module.MeshValues(mesh, table)}
+        slabs_module.write_sampled(tmp_path / "v.npy", arrays, GRID, slabs_module.Sampling(), x_first=True)
+        found = np.load(tmp_path / "v.npy")
+        expected = sampled(mesh, table)
+        np.testing.assert_array_equal(found, expected if name == "scalars" else np.moveaxis(expected, -1, 0))

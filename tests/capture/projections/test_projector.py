@@ -5,6 +5,7 @@ import pytest
 import torch
 from capture.projections import line_reference
 
+import difftetvr as dtv
 from difftetvr.capture import ProjectionGeometry, project_volume
 from difftetvr.errors import CaptureError
 from difftetvr.rendering import Detector
@@ -111,6 +112,24 @@ def test_an_ellipsoid_of_fine_voxels_has_its_known_shadow(method):
         chord = 2 * np.sqrt(np.maximum(b * b - a * c, 0)) / a
         assert np.abs(found[view] - chord).mean() < 0.005 * chord.max()
         assert found[view].sum() == pytest.approx(chord.sum(), rel=0.01)
+
+
+@pytest.mark.parametrize("kind", [CONE, PARALLEL], ids=["cone", "parallel"])
+def test_a_mesh_with_the_same_values_is_rendered_to_the_same_line_integrals(kind):
+    """Rays, pixels and the end of the detector are those of `render`, to which the geometry is handed as it is."""
+    geometry = ProjectionGeometry.from_dict(kind)
+    count, (lower, upper) = 24, geometry.bounds.tolist()
+    mesh = dtv.TetMesh.grid((3, 3, 3), lower, upper, dtype=torch.float64)
+    slope = torch.tensor([0.5, -0.3, 0.2], dtype=torch.float64)
+    field = dtv.Field(torch.zeros(mesh.num_vertices, 3, dtype=torch.float64), 3 + mesh.vertices @ slope)
+    step = (geometry.bounds[1] - geometry.bounds[0]) / count
+    axes = [geometry.bounds[0, a] + (torch.arange(count) + 0.5) * step[a] for a in range(3)]
+    values = 3 + sum(s * c for s, c in zip(slope, torch.meshgrid(*axes, indexing="ij")))
+    found = project_volume(values, geometry, "trilinear", dtype=torch.float64, device="cpu")
+    for view in range(3):
+        rendered = dtv.render(mesh, field, geometry.view(view)).optical_depth
+        # Values are constant from the outermost middles to the faces of the box: that is what remains.
+        torch.testing.assert_close(found[view], rendered, atol=0.002, rtol=0.002)
 
 
 def test_many_views_are_projected_in_parts_and_counted(monkeypatch):

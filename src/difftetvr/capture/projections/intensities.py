@@ -9,6 +9,9 @@ import numpy as np
 from difftetvr.capture.projections.noise import log_variance
 from difftetvr.errors import CaptureError, counted, shown
 
+_GREATEST = 1e30  # count, so that squares of counts are numbers
+_LEAST_TRANSMISSION = 1e-15  # of what is taken for light, and not for rounding
+
 
 class Absorbed(NamedTuple):
     """Line integrals of intensities.
@@ -45,9 +48,9 @@ def absorbed(intensities: np.ndarray, flat: Any, dark: Any, sigma: float, name: 
     """
     bright, bright_frames = _field(flat, intensities.shape, "flat", name)
     black, black_frames = _field(0.0 if dark is None else dark, intensities.shape, "dark", name)
-    light = bright - black
-    with np.errstate(invalid="ignore"):
-        dead = ~(np.isfinite(light) & (light > 0))
+    with np.errstate(invalid="ignore", over="ignore"):
+        light = bright - black
+        dead = ~((light > 1 / _GREATEST) & (light < _GREATEST))
     if dead.all():
         raise CaptureError(f"The flat field of '{name}' is nowhere brighter than its dark field; check which is which.")
     open_beam = np.where(dead, 1.0, light)
@@ -55,14 +58,14 @@ def absorbed(intensities: np.ndarray, flat: Any, dark: Any, sigma: float, name: 
     line_integrals = np.zeros(intensities.shape, dtype=np.float32)
     variance, valid = np.ones_like(line_integrals), np.zeros(intensities.shape, dtype=bool)
     for view, into, spread, kept in zip(intensities, line_integrals, variance, valid):
-        signal = view.astype(np.float64) - black
-        with np.errstate(invalid="ignore"):
-            kept[:] = np.isfinite(signal) & (signal > 0) & ~dead
+        with np.errstate(invalid="ignore", over="ignore"):
+            signal = view.astype(np.float64) - black
+            kept[:] = (signal > _LEAST_TRANSMISSION * open_beam) & (signal < _GREATEST) & ~dead
         signal = np.where(kept, signal, 1.0)
         into[:] = np.where(kept, np.log(open_beam) - np.log(signal), 0.0)
         # The dark frames' own noise is that of the electronics, and small.
         noise = log_variance(signal, sigma) + sigma**2 / (black_frames * signal**2) + background
-        spread[:] = np.where(kept, noise, 1.0)
+        spread[:] = np.where(kept, np.minimum(noise, _GREATEST), 1.0)
     if not valid.any():
         raise CaptureError(f"No pixel of '{name}' counts more than its dark field; check which arrays are which.")
     line_integrals[~valid] = line_integrals[valid].max()
@@ -87,7 +90,8 @@ def _field(given: Any, shape: tuple[int, ...], what: str, name: str) -> tuple[np
     array = np.asarray(given)
     is_real = array.dtype.kind in "iuf"
     if is_real and array.ndim == 3 and array.shape[1:] == shape[1:] and len(array):
-        return array.mean(axis=0, dtype=np.float64), len(array)
+        with np.errstate(invalid="ignore", over="ignore"):
+            return array.mean(axis=0, dtype=np.float64), len(array)
     if not is_real or array.shape not in ((), shape[1:]):
         size = " x ".join(map(str, shape[1:]))
         raise CaptureError(

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from difftetvr.capture.volumes.volume_file import RawVolume
+from difftetvr.capture.volumes.volume_file import RawVolume, World
 from difftetvr.errors import CaptureError
 
 # Direction cosines are written with about six digits; over a thousand samples this is half of one.
@@ -36,7 +36,8 @@ def in_world_axes(raw: RawVolume, source: str | Path) -> RawVolume:
     values = raw.values.transpose([2 - axes.index(axis) for axis in (2, 1, 0)])
     values = np.flip(values, tuple(2 - axes[a] for a in range(3) if signs[a] < 0))
     x, y, z = (raw.spacing[axes.index(axis)] for axis in range(3))
-    return RawVolume(values, (x, y, z), None, (*raw.notes, *_tilt(raw.directions, axes, source)))
+    notes = (*raw.notes, *_tilt(raw.directions, axes, source))
+    return RawVolume(values, (x, y, z), None, notes, World(unit=raw.world.unit))
 
 
 def require_right_angles(directions: np.ndarray, source: str | Path) -> None:

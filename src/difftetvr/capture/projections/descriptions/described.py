@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from difftetvr.capture.projections.descriptions.circular import Circular
-from difftetvr.capture.projections.descriptions.entries import Entries
+from difftetvr.capture.projections.descriptions.entries import Entries, in_sentence
 from difftetvr.errors import CaptureError
 from difftetvr.rendering.cameras.detector import Detector
 
@@ -95,7 +95,9 @@ def bounds_of(entries: Entries, scan: Circular | None) -> Floats:
         raise CaptureError(f"{entries.source} lacks the entry 'volume_size'; give the size of the box to reconstruct.")
     bounds = scan.field_of_view() + offset
     if not (bounds[0] < bounds[1]).all():
-        raise CaptureError(f"No place is seen by all views of {entries.source}; give 'volume_size', or correct it.")
+        raise CaptureError(
+            f"No place is seen by all views of {in_sentence(entries.source)}; give 'volume_size', or correct it."
+        )
     return bounds
 
 
@@ -160,13 +162,14 @@ def _free(entries: Entries) -> tuple[Detector, Floats | None]:
         entries.refuse("views", "give a list with an object for each view")
     tables: dict[str, list[Floats]] = {}
     for index, view in enumerate(views):
-        item = Entries(view, f"View {index} of {entries.source}")
+        item = Entries(view, f"View {index} of {in_sentence(entries.source)}")
         item.require_known(_VIEW)
         for name in (name for name in _VIEW if name in item or name in ("center", "columns", "rows")):
             tables.setdefault(name, []).append(item.numbers(name, (3,)))
     beams = [name for name in ("source", "direction") if name in tables]
     if len(beams) != 1 or len(tables[beams[0]]) != len(views):
-        raise CaptureError(f"The views of {entries.source} need each a 'source', or each a 'direction'; correct them.")
+        source = in_sentence(entries.source)
+        raise CaptureError(f"The views of {source} need each a 'source', or each a 'direction'; correct them.")
     tensors = {name: torch.from_numpy(np.stack(rows)) for name, rows in tables.items()}
     angles = entries.numbers("angles") if "angles" in entries else None
     if angles is not None and len(angles) != len(views):

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from difftetvr.errors import CaptureError, shown
 from difftetvr.trust import require_modest, require_regular
 
+_GREATEST = 1e30  # of numbers that mean lengths and angles, so that products of several are numbers
 _IN_MEMORY = 10  # times a file's size: what its numbers take as objects of Python
 
 
@@ -46,8 +47,8 @@ class Entries:
         for name in self.values:
             if name not in known:
                 alike = difflib.get_close_matches(str(name), known, 1)
-                hint = f"is it '{alike[0]}'?" if alike else f"known are {', '.join(known)}."
-                raise CaptureError(f"{self.source} has an unknown entry {shown(name)}; {hint}")
+                hint = f" (is it '{alike[0]}'?); correct it." if alike else f"; known are {', '.join(known)}."
+                raise CaptureError(f"{self.source} has an unknown entry {shown(name)}{hint}")
 
     def text(self, name: str, choices: Sequence[str] = ()) -> str | None:
         """A text; None where there is none.
@@ -147,7 +148,7 @@ class Entries:
 
 
 def as_numbers(value: Any) -> NDArray[np.float64] | None:
-    """Finite numbers as an array; None for all else, truth values and texts among them."""
+    """Finite numbers of at most 1e30 as an array; None for all else, truth values and texts among them."""
     try:
         raw = np.asarray(value)
         if raw.dtype.kind not in "iuf":
@@ -155,7 +156,8 @@ def as_numbers(value: Any) -> NDArray[np.float64] | None:
         numbers = raw.astype(np.float64)
     except (ValueError, TypeError, OverflowError):
         return None
-    return numbers if bool(np.isfinite(numbers).all()) else None
+    with np.errstate(invalid="ignore"):
+        return numbers if bool((np.abs(numbers) <= _GREATEST).all()) else None
 
 
 def in_sentence(source: str) -> str:
