@@ -247,7 +247,10 @@ def changed(kind: dict, **entries: object) -> dict:
         ([1], "give an object with names and values"),
         (changed(CONE, type="nothing"), "lacks the entry 'type'"),
         (changed(CONE, type="spiral"), "'type' of the geometry is 'spiral'; give one of cone"),
-        (changed(CONE, soruce_distance=3), "unknown entry 'soruce_distance'; is it 'source_distance'"),
+        (
+            changed(CONE, soruce_distance=3),
+            r"unknown entry 'soruce_distance' \(is it 'source_distance'\?\); correct it",
+        ),
         (changed(CONE, source_distance="nothing"), "lacks the entry 'source_distance'"),
         (changed(CONE, source_distance=-5), "give a number greater than 0"),
         (changed(CONE, source_distance=float("nan")), "give a number greater than 0"),
