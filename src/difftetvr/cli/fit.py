@@ -147,7 +147,7 @@ class Fit:
     @staticmethod
     def variant(args: Sequence[str]) -> type:
         """This command, or that for projections, where the arguments name some."""
-        from difftetvr.cli.fit_scan import FitScan, fits_scan  # most fits are of images
+        from difftetvr.cli.inverse.fit_scan import FitScan, fits_scan  # most fits are of images
 
         return FitScan if fits_scan(args) else Fit
 

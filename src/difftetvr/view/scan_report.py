@@ -16,7 +16,6 @@ from difftetvr.fitting.metrics import psnr_of_mse
 from difftetvr.fitting.records.folder import RunFolder, write_json
 from difftetvr.inverse.tomography.loop import TomographyResult
 from difftetvr.inverse.tomography.measurements import Measurements
-from difftetvr.mesh.field import Field
 from difftetvr.mesh.io import save
 from difftetvr.rendering import render
 from difftetvr.sampling.voxels import voxelise
@@ -127,11 +126,9 @@ def _views(result: TomographyResult, scan: Measurements) -> Image.Image:
     chosen = views[:: max(1, -(-len(views) // _COMPARED_VIEWS))]
     rows = []
     for view in chosen:
-        part = scan.pixels(view, scan.all_pixels)
-        density = result.field.density.to(scan.device)
-        field = Field(density.new_zeros(len(density), 0), density, "vertex")
         with torch.no_grad():
-            found = render(result.mesh, field, part.camera).optical_depth
+            part = scan.pixels(view, scan.all_pixels, alignment=result.alignment)
+            found = render(result.mesh, result.field, part.camera).optical_depth
         residual = (found - part.measured) * part.weight.sqrt()
         # Grey is none; black and white are three times the noise.
         panels = [

@@ -14,6 +14,7 @@ from difftetvr.errors import FitError
 from difftetvr.fitting.motion import Motion
 from difftetvr.fitting.options import LARGEST_COUNT, first_difference, options_from_json, require
 from difftetvr.fitting.refinement import Exchange, Grow, Strategy
+from difftetvr.inverse.tomography.alignment import Refined
 from difftetvr.mesh.limits import MAX_CELLS
 
 if TYPE_CHECKING:
@@ -84,6 +85,11 @@ class TomographyConfig:
     """Whether vertices move."""
     refine: Refine = "exchange"
     """How the mesh refines itself: exchange cells at their full number, grow from a coarse mesh, or not at all."""
+    align: Refined = "none"
+    """Corrections of the geometry that are learned along: the place and tilt of the axis, the same in all views (axis),
+    or each view's shift besides (views)."""
+    align_rate: float = 0.5
+    """Their rate in the first step, in pixels; it falls as that of densities does."""
     solve_steps: int = 10
     """Steps of conjugate gradients after the last iteration, for densities alone; 0: none."""
     solve_rays: int = 3_000_000
@@ -110,14 +116,14 @@ class TomographyConfig:
         for name, (least, most) in _RANGES.items():
             value = getattr(self, name)
             require(value is None or least <= value <= most, name, value, f"at least {least} and at most {most}")
-        for name in ("rate", "final_rate"):
+        for name in ("rate", "final_rate", "align_rate"):
             value = getattr(self, name)
             require(value > 0 and math.isfinite(value), name, value, "greater than 0 and finite")
         for name in ("total_variation", "tikhonov", "checkpoint_seconds"):
             value = getattr(self, name)
             require(value >= 0 and math.isfinite(value), name, value, "at least 0 and finite")
         require(all(0 <= b < 1 for b in self.betas), "betas", self.betas, "at least 0 and less than 1")
-        for name, kind in (("likelihood", Likelihood), ("refine", Refine)):
+        for name, kind in (("likelihood", Likelihood), ("refine", Refine), ("align", Refined)):
             value = getattr(self, name)
             require(value in get_args(kind), name, value, f"one of {', '.join(get_args(kind))}")
 

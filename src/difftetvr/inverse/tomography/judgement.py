@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import torch
 
-from difftetvr.inverse.tomography.config import Likelihood, TomographyConfig
+from difftetvr.inverse.tomography.config import Likelihood
 from difftetvr.inverse.tomography.likelihoods import LIKELIHOODS, Residuals
-from difftetvr.inverse.tomography.measurements import Measurements, PixelSet
+from difftetvr.inverse.tomography.measurements import PixelSet
 from difftetvr.mesh.field import Field
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.rendering import render
@@ -33,21 +33,9 @@ class Judgement:
     deterministic: bool
 
     @staticmethod
-    def of(scan: Measurements, config: TomographyConfig, iteration: int, views: int, mesh: TetMesh) -> Judgement:
-        """Choose pixels: evenly spread, and as many as predictions about the cells of a mesh need.
-
-        Args:
-            scan: The scan.
-            config: Options.
-            iteration: Iterations done.
-            views: How many views to look at; all where there are fewer.
-            mesh: The mesh that is to be refined.
-        """
-        random = config.refinement_random(iteration)
-        chosen = [scan.train[int(k)] for k in random.permutation(len(scan.train))[:views]]
-        wanted = max(1, round(_CROSSINGS * mesh.num_cells ** (2 / 3) / len(chosen)))
-        parts = [scan.pixels(view, wanted, (float(random.random()), float(random.random()))) for view in chosen]
-        return Judgement(parts, config.likelihood, config.deterministic)
+    def wanted(mesh: TetMesh) -> int:
+        """How many pixels predictions about the cells of a mesh need."""
+        return max(1, round(_CROSSINGS * mesh.num_cells ** (2 / 3)))
 
     def some(self) -> Judgement:
         """A few of the views: enough to see what became of the error."""

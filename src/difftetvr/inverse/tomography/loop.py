@@ -17,6 +17,7 @@ from difftetvr.fitting.records.checkpoint import Checkpoint, alone_with
 from difftetvr.fitting.records.history import History
 from difftetvr.fitting.records.result import Progress
 from difftetvr.inputs import require_type
+from difftetvr.inverse.tomography.alignment import Alignment
 from difftetvr.inverse.tomography.config import TomographyConfig
 from difftetvr.inverse.tomography.reconstruction import Reconstruction
 from difftetvr.inverse.tomography.scoring import ProjectionScore
@@ -36,6 +37,7 @@ class TomographyResult:
         score: How well held-out views are predicted.
         history: Loss and PSNR of line integrals per iteration.
         config: Options that it was made with.
+        alignment: Corrections of the geometry.
     """
 
     mesh: TetMesh
@@ -43,6 +45,7 @@ class TomographyResult:
     score: ProjectionScore
     history: History
     config: TomographyConfig
+    alignment: Alignment
 
     @property
     def metrics(self) -> dict[str, Any]:
@@ -50,6 +53,7 @@ class TomographyResult:
         last = self.history.psnr[-_TRAIN_WINDOW:]
         return {
             **self.score.to_json(),
+            **self.alignment.to_json(),
             "train_psnr": sum(last) / len(last) if last else None,
             "cells": self.mesh.num_cells,
             "vertices": self.mesh.num_vertices,
@@ -141,4 +145,4 @@ def optimise(
         score = run.score(run.measurements.test)
     density = run.densities.detached()
     field = Field(density.new_zeros(len(density), 0), density, "vertex")
-    return TomographyResult(run.mesh, field, score, run.history, run.config)
+    return TomographyResult(run.mesh, field, score, run.history, run.config, run.alignment)

@@ -10,6 +10,7 @@ import torch
 
 from difftetvr.capture.projections.geometry import ProjectionGeometry
 from difftetvr.capture.projections.projection_capture import ProjectionCapture
+from difftetvr.inverse.tomography.alignment import Alignment
 from difftetvr.mesh.field import Field
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.rendering import render
@@ -75,20 +76,26 @@ class Measurements:
         """Pixels of a view."""
         return math.prod(self._measured.shape[1:])
 
-    def pixels(self, view: int, count: int, phase: tuple[float, float] = (0.5, 0.5)) -> PixelSet:
+    def pixels(
+        self, view: int, count: int, phase: tuple[float, float] = (0.5, 0.5), alignment: Alignment | None = None
+    ) -> PixelSet:
         """About so many pixels of a view in equal steps along rows and columns; all where there are no more.
 
         Args:
             view: Number of the view.
             count: How many pixels are wanted, at most.
             phase: Where in a step of rows and of columns they begin, in [0, 1).
+            alignment: Corrections of the geometry; what they move is differentiable in them.
         """
         height, width = self._measured.shape[1:]
         down, across = steps_for(height, width, count)
         first = (min(int(phase[0] * down), height - 1), min(int(phase[1] * across), width - 1))
         measured, weight = (part[view, first[0] :: down, first[1] :: across] for part in (self._measured, self._weight))
-        detector = strided(self.capture.geometry.view(view), first, (down, across), tuple(measured.shape))
-        if not self._is_before_detector:
+        detector = self.capture.geometry.view(view)
+        if alignment is not None:
+            detector = alignment.applied(detector, view)
+        detector = strided(detector, first, (down, across), tuple(measured.shape))
+        if not self._is_before_detector or detector.center.requires_grad:
             return PixelSet(detector, measured, weight)
         if (camera := as_camera(detector)) is not None:
             return PixelSet(camera, measured, weight)

@@ -19,6 +19,7 @@ from difftetvr.fitting.records.history import History, RefinementRecord
 from difftetvr.fitting.records.result import Progress
 from difftetvr.fitting.records.unread import Unread
 from difftetvr.fitting.refinement import Moment, Refinement, Situation, Strategy
+from difftetvr.inverse.tomography.alignment import Alignment
 from difftetvr.inverse.tomography.config import TomographyConfig
 from difftetvr.inverse.tomography.densities import Densities
 from difftetvr.inverse.tomography.judgement import Judgement
@@ -45,6 +46,7 @@ class Reconstruction:
         measurements: The scan.
         config: Options.
         densities: Densities under optimisation.
+        alignment: Corrections of the geometry under optimisation.
         positions: Vertex positions under optimisation; None where they are fixed.
         iteration: Iterations done.
         history: What happened so far; PSNR is that of line integrals, with the greatest of the scan as peak.
@@ -69,6 +71,7 @@ class Reconstruction:
         self._mesh = (mesh or _grid(capture, config, self.strategy)).to(device=device)
         self.positions = VertexOptimizer(self._mesh, config.motion) if config.move else None
         self.densities = Densities(self._mesh, self.measurements.density_unit, config.rate, config.betas)
+        self.alignment = Alignment(config.align, capture.geometry.shape, device)
         self.objective = Objective.of(config, float((capture.geometry.bounds[1] - capture.geometry.bounds[0]).prod()))
         self.budget = max(config.budget, self._mesh.num_cells if mesh is not None else 0)
         self.iteration, self.history = 0, History()
@@ -94,6 +97,7 @@ class Reconstruction:
         self._unread.add(self.iteration, *self._gather(mesh))
         self._unread.read_errors(self.history)
         self.densities.step(config.rate_at(self.iteration))
+        self.alignment.step(config.align_rate * config.rate_at(self.iteration) / config.rate)
         self._move(rate)
         self.iteration += 1
 
@@ -109,12 +113,24 @@ class Reconstruction:
             self.mesh,
             self.densities.values,
             self.densities.unit,
-            lambda: (scan.pixels(view, each) for view in scan.train),
+            lambda: (self._fixed(view, each) for view in scan.train),
             self.objective,
             self.config.solve_steps,
             on_step,
         )
         self.densities.set(found.values)
+
+    def _pixels_to_judge(self, views: int, count: int) -> list[PixelSet]:
+        """Pixels of random training views, for what a refinement is judged on.
+
+        Args:
+            views: How many views; all where there are fewer.
+            count: Pixels in all.
+        """
+        random, scan = self.config.refinement_random(self.iteration), self.measurements
+        chosen = [scan.train[int(k)] for k in random.permutation(len(scan.train))[:views]]
+        each = max(1, count // len(chosen))
+        return [self._fixed(view, each, (float(random.random()), float(random.random()))) for view in chosen]
 
     def glance(self) -> None:
         """Notes the PSNR of line integrals of a few held-out views, for the curves; decides nothing."""
@@ -131,7 +147,8 @@ class Reconstruction:
             views: Their numbers.
             pixels: Pixels of each to look at, at most; default: all.
         """
-        return score_views(self.mesh, self.densities.detached(), self.measurements, views, pixels)
+        parts = [(view, self._fixed(view, pixels or self.measurements.all_pixels)) for view in views]
+        return score_views(self.mesh, self.densities.detached(), self.measurements.peak, parts)
 
     def progress(self, seconds: float) -> Progress:
         """A summary for a display; loss and PSNR are means over the last pass through the training views."""
@@ -153,7 +170,8 @@ class Reconstruction:
     def checkpoint(self) -> Checkpoint:
         """The state, to be saved."""
         self._unread.read_moves(self.history)
-        tensors = {"vertices": self.mesh.vertices, "tets": self.mesh.tets, **self.densities.state()}
+        tensors = {"vertices": self.mesh.vertices, "tets": self.mesh.tets}
+        tensors |= self.densities.state() | self.alignment.state()
         if self.positions:
             state = self.positions.state()
             tensors |= {_POSITIONS + name: tensor for name, tensor in state.items() if name != "vertices"}
@@ -179,6 +197,7 @@ class Reconstruction:
                 )
         checkpoint.require_tensors_like(run.checkpoint().tensors)
         run.densities.restore(checkpoint.tensors)
+        run.alignment.restore(checkpoint.tensors)
         if run.positions:
             state = {k.removeprefix(_POSITIONS): v for k, v in checkpoint.tensors.items()}
             run.positions.restore(state)
@@ -197,7 +216,9 @@ class Reconstruction:
         random = config.phases_at(self.iteration)
         views = [scan.train[k] for k in config.views_at(self.iteration, len(scan.train))]
         each = max(1, config.rays // len(views))
-        parts = [scan.pixels(view, each, (float(random.random()), float(random.random()))) for view in views]
+        self.alignment.zero_grad()
+        phases = [(float(random.random()), float(random.random())) for _ in views]
+        parts = [scan.pixels(view, each, phase, self.alignment) for view, phase in zip(views, phases, strict=True)]
         count = max(1, sum(int((part.weight > 0).sum()) for part in parts))
         loss = error = torch.zeros((), dtype=torch.float64, device=scan.device)
         for part in parts:
@@ -211,6 +232,11 @@ class Reconstruction:
         if self.iteration % _PENALTY_EVERY == 0:
             self._penalise(mesh)
         return loss, error / scan.peak**2
+
+    @torch.no_grad()
+    def _fixed(self, view: int, count: int, phase: tuple[float, float] = (0.5, 0.5)) -> PixelSet:
+        """Pixels of a view where the geometry is as it is now."""
+        return self.measurements.pixels(view, count, phase, self.alignment)
 
     def _penalise(self, mesh: TetMesh) -> None:
         """Adds the penalty's derivatives, those of as many iterations as share them."""
@@ -241,7 +267,8 @@ class Reconstruction:
         if self.strategy is None or not self.strategy.is_due(self._moment()):
             return
         mesh, densities = self.mesh, self.densities
-        judgement = Judgement.of(self.measurements, self.config, self.iteration, self.strategy.views, mesh)
+        parts = self._pixels_to_judge(self.strategy.views, Judgement.wanted(mesh))
+        judgement = Judgement(parts, self.config.likelihood, self.config.deterministic)
 
         def model(steps: torch.Tensor | None) -> ImageModel:
             return judgement.model(mesh, densities.detached(), densities.unit, steps)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 
 from difftetvr.fitting.metrics import psnr_of_mse
-from difftetvr.inverse.tomography.measurements import Measurements
+from difftetvr.inverse.tomography.measurements import PixelSet
 from difftetvr.mesh.field import Field
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.rendering import render
@@ -53,26 +54,24 @@ class ProjectionScore:
 
 @torch.no_grad()
 def score_views(
-    mesh: TetMesh, density: torch.Tensor, scan: Measurements, views: list[int], pixels: int | None = None
+    mesh: TetMesh, density: torch.Tensor, peak: float, parts: Sequence[tuple[int, PixelSet]]
 ) -> ProjectionScore:
     """Compares views with what is predicted of them; those without a valid pixel are left out.
 
     Args:
         mesh: The mesh.
         density: (V,) densities per unit of length.
-        scan: The scan.
-        views: Numbers of the views.
-        pixels: Pixels of each to look at, at most; default: all.
+        peak: Greatest line integral of the scan.
+        parts: Numbers of views, and what was measured of each.
     """
     seen, psnrs, noises = [], [], []
-    for view in views:
-        part = scan.pixels(view, pixels or scan.all_pixels)
+    field = Field(density.new_zeros(len(density), 0), density, "vertex")
+    for view, part in parts:
         counts = part.weight > 0
         if not bool(counts.any()):
             continue
-        field = Field(density.new_zeros(len(density), 0), density, "vertex")
         squares = (render(mesh, field, part.camera).optical_depth - part.measured)[counts].double().square()
         seen.append(view)
-        psnrs.append(psnr_of_mse(float(squares.mean()) / scan.peak**2))
+        psnrs.append(psnr_of_mse(float(squares.mean()) / peak**2))
         noises.append(float((squares * part.weight[counts]).mean().sqrt()))
     return ProjectionScore(seen, psnrs, noises)

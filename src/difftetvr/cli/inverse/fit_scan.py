@@ -100,6 +100,7 @@ class FitScan:
             *("device", "resume", "overwrite"),
         ),
         "Objective": ("likelihood", "tikhonov", "rays", "batch-views", "solve-steps", "solve-rays"),
+        "Geometry": ("align", "align-rate"),
         "Motion": ("move", "motion.*"),
         "Refinement": ("refine", "exchange.*", "grow.*"),
         "Optimisation": ("rate", "final-rate", "betas", "seed", "deterministic"),
@@ -248,6 +249,9 @@ def _say_result(console: Console, result: TomographyResult, compared: dict[str, 
     lines = [f"Held out: {held_out}"]
     if compared:
         lines.append(f"Against the truth: PSNR {compared['volume_psnr']:.2f} dB at the voxels' centres")
+    if result.alignment.is_learned:
+        shift, tilt = result.alignment.to_json().values()
+        lines.append(f"Axis: seen {shift:+.2f} pixels beside where it was said to be, tilted by {tilt:+.3f} degrees")
     lines += [
         f"{counted(metrics['cells'], 'cell')}, {counted(metrics['iterations'], 'iteration')} in "
         f"{metrics['seconds']:.1f} s",

@@ -1,0 +1,126 @@
+"""Corrections of a scan's geometry that are learned with the densities: where the axis is, how views are shifted.
+
+All of them move the detector in its own plane, in pixels, and images are differentiable in where it is. A shift of all
+views along the rows is where the axis of rotation is seen; one across them cannot be told from a shift of the object
+and is learned for single views alone.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Literal
+
+import torch
+
+from difftetvr.rendering.cameras.detector import Detector
+
+Refined = Literal["none", "axis", "views"]
+"""What is corrected: nothing; the place and the tilt of the axis in all views alike; or each view's shift besides."""
+
+_BETAS = (0.9, 0.99)
+_TILT_PER_PIXEL = 2.0  # a step of the tilt moves the ends of a row by about as much as one of the shift moves all
+
+
+class Alignment:
+    """Corrections under optimisation, with their Adam optimiser.
+
+    Attributes:
+        shift: (2,) shift of all views along rows and columns of pixels, in pixels; the second one stays 0.
+        tilt: () rotation of all detectors in their plane, in radians.
+        of_views: (V, 2) shifts of single views besides, in pixels; none for views that are held out.
+    """
+
+    def __init__(self, kind: Refined, size: tuple[int, int, int], device: torch.device) -> None:
+        """Nothing is corrected yet.
+
+        Args:
+            kind: What is to be.
+            size: Views, rows and columns.
+            device: Where densities are.
+        """
+        views, _, width = size
+        self.shift = torch.zeros(2, dtype=torch.float64, device=device)
+        self.tilt = torch.zeros((), dtype=torch.float64, device=device)
+        self.of_views = torch.zeros(views, 2, dtype=torch.float64, device=device)
+        count = {"none": 0, "axis": 2, "views": 3}[kind]
+        self._leaves = [self.shift, self.tilt, self.of_views][:count]
+        for leaf in self._leaves:
+            leaf.requires_grad_()
+        self._rates = [1.0, _TILT_PER_PIXEL / width, 1.0][:count]
+        self._optimizer = None
+        if self._leaves:
+            groups = [{"params": [leaf]} for leaf in self._leaves]
+            self._optimizer = torch.optim.Adam(groups, betas=_BETAS)
+            for leaf in self._leaves:
+                zeros = torch.zeros_like(leaf, requires_grad=False)
+                self._optimizer.state[leaf] = {"step": torch.zeros(()), "exp_avg": zeros, "exp_avg_sq": zeros.clone()}
+
+    @property
+    def is_learned(self) -> bool:
+        """Whether anything is corrected."""
+        return bool(self._leaves)
+
+    def applied(self, detector: Detector, view: int) -> Detector:
+        """The detector of a view where the corrections put it; differentiable in them.
+
+        Args:
+            detector: Where it was said to be.
+            view: Number of the view.
+        """
+        if not self.is_learned:
+            return detector
+        columns, rows = detector.columns.to(self.tilt.device), detector.rows.to(self.tilt.device)
+        normal = torch.linalg.cross(columns, rows)
+        normal = normal / normal.norm()
+        cosine, sine = torch.cos(self.tilt), torch.sin(self.tilt)
+        columns, rows = (cosine * part + sine * torch.linalg.cross(normal, part) for part in (columns, rows))
+        shift = self.shift + self.of_views[view]
+        center = detector.center.to(self.tilt.device) + shift[0] * columns + shift[1] * rows
+        return dataclasses.replace(detector, center=center, columns=columns, rows=rows)
+
+    def to_json(self) -> dict[str, float]:
+        """What holds for all views, as JSON values; nothing where nothing is corrected."""
+        if not self.is_learned:
+            return {}
+        return {
+            "axis_shift_pixels": float(self.shift[0].detach()),
+            "axis_tilt_degrees": math.degrees(float(self.tilt.detach())),
+        }
+
+    def zero_grad(self) -> None:
+        """Forgets the gradients."""
+        if self._optimizer is not None:
+            self._optimizer.zero_grad(set_to_none=True)
+
+    def step(self, rate: float) -> None:
+        """One step with the accumulated gradients.
+
+        Args:
+            rate: Its length, in pixels.
+        """
+        if self._optimizer is None:
+            return
+        if self.shift.grad is not None:
+            self.shift.grad[1] = 0.0
+        for group, share in zip(self._optimizer.param_groups, self._rates, strict=True):
+            group["lr"] = share * rate
+        self._optimizer.step()
+
+    def state(self) -> dict[str, torch.Tensor]:
+        """Corrections and optimiser state by name."""
+        if self._optimizer is None:
+            return {}
+        names = ("shift", "tilt", "of_views")
+        tensors = {}
+        for name, leaf in zip(names, self._leaves, strict=False):
+            tensors[f"alignment.{name}"] = leaf
+            for key, value in self._optimizer.state[leaf].items():
+                tensors[f"alignment.{name}.{key}"] = value
+        return tensors
+
+    def restore(self, tensors: dict[str, torch.Tensor]) -> None:
+        """The inverse of :meth:`state`."""
+        with torch.no_grad():
+            for name, tensor in self.state().items():
+                tensor.copy_(tensors[name])
