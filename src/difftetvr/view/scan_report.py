@@ -26,6 +26,7 @@ _SLICE_PIXELS = 384
 _DIFFERENCE_GAIN = 4.0
 _COMPARED_VIEWS = 3
 _AXES = ("x", "y", "z")
+_THICK = 16
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,10 @@ def _slices(result: TomographyResult, scan: Measurements, truth: Truth | None) -
     """The middle slices across all axes: what was found, and beside it what is true and the difference."""
     brightest = float((result.field.density if truth is None else truth.values).max())
     rows = []
-    for axis in range(3):
+    sides = scan.capture.geometry.bounds[1] - scan.capture.geometry.bounds[0]
+    # Across the other axes, thin slabs show nothing.
+    seen = [axis for axis in range(3) if _THICK * sides[axis] >= sides.max()]
+    for axis in seen if len(seen) == 3 else [int(sides.argmin())]:
         found = _slice(result, scan, axis) / max(brightest, 1e-30)
         panels = []
         if truth is not None:

@@ -31,16 +31,17 @@ class Alignment:
         of_views: (V, 2) shifts of single views besides, in pixels; none for views that are held out.
     """
 
-    def __init__(self, kind: Refined, size: tuple[int, int, int], device: torch.device) -> None:
-        """Nothing is corrected yet.
+    def __init__(self, kind: Refined, size: tuple[int, int, int], device: torch.device, shift: float = 0.0) -> None:
+        """Nothing is learned yet.
 
         Args:
             kind: What is to be.
             size: Views, rows and columns.
             device: Where densities are.
+            shift: Where the axis is taken to be, in pixels.
         """
         views, _, width = size
-        self.shift = torch.zeros(2, dtype=torch.float64, device=device)
+        self.shift = torch.tensor([shift, 0.0], dtype=torch.float64, device=device)
         self.tilt = torch.zeros((), dtype=torch.float64, device=device)
         self.of_views = torch.zeros(views, 2, dtype=torch.float64, device=device)
         count = {"none": 0, "axis": 2, "views": 3}[kind]

@@ -22,6 +22,7 @@ _LEAST_NOISE = 1e-4  # of the greatest line integral: where noise is estimated a
 _ROBUST = 1.4826  # of a normal distribution, the standard deviation in medians of magnitudes
 _LAPLACIAN = 6.0  # root of the sum of the squares of the second differences' weights, 1 -2 1 by 1 -2 1
 _LEAST, _SAMPLE = 1e-30, 1_000_000
+_LEAST_SINE = 8
 _UNIT_RAYS = 16_384
 
 
@@ -103,6 +104,27 @@ class Measurements:
         if mirrored is not None:
             return PixelSet(mirrored, measured.flip(1), weight.flip(1))
         return PixelSet(detector, measured, weight)
+
+    def axis_shift(self) -> float:
+        """Pixels by which the detector has to move along its rows so that the axis is where its views turn around.
+
+        The centre of what a parallel view absorbs swings around the axis as a sine of the angle (the first moment of
+        Helgason and Ludwig's conditions), and nearly so that of a cone beam. 0 where angles are not known, or are fewer
+        than tell a sine.
+        """
+        angles = self.capture.geometry.angles
+        views = [view for view in self.train if bool((self._weight[view] > 0).any())]
+        if angles is None or len(views) < _LEAST_SINE:
+            return 0.0
+        width = self._measured.shape[2]
+        seen = torch.where(self._weight[views] > 0, self._measured[views], 0.0).clamp(min=0.0).double().sum(1).cpu()
+        place = torch.arange(width, dtype=torch.float64) + 0.5 - 0.5 * width
+        mass = seen.sum(1)
+        centers = (seen * place).sum(1) / mass.clamp(min=_LEAST)
+        turns = torch.deg2rad(angles[views])
+        sines = torch.stack((torch.ones_like(turns), torch.cos(turns), torch.sin(turns)), 1)
+        fitted = torch.linalg.lstsq(sines, centers[:, None]).solution[0, 0]
+        return -float(fitted) if bool((mass > 0).all()) else 0.0
 
     def _estimated_weight(self) -> torch.Tensor:
         """(V, H, W) one over the variance of noise that is the same everywhere, by second differences (Immerkaer 1996).

@@ -71,7 +71,8 @@ class Reconstruction:
         self._mesh = (mesh or _grid(capture, config, self.strategy)).to(device=device)
         self.positions = VertexOptimizer(self._mesh, config.motion) if config.move else None
         self.densities = Densities(self._mesh, self.measurements.density_unit, config.rate, config.betas)
-        self.alignment = Alignment(config.align, capture.geometry.shape, device)
+        shift = 0.0 if config.align == "none" else self.measurements.axis_shift()
+        self.alignment = Alignment(config.align, capture.geometry.shape, device, shift)
         self.objective = Objective.of(config, float((capture.geometry.bounds[1] - capture.geometry.bounds[0]).prod()))
         self.budget = max(config.budget, self._mesh.num_cells if mesh is not None else 0)
         self.iteration, self.history = 0, History()
