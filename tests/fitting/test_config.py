@@ -1,5 +1,6 @@
 """Options, schedules and the choice of the grid."""
 
+import dataclasses
 import json
 from typing import get_args
 
@@ -58,6 +59,15 @@ def test_rate_falls_log_linearly():
     assert FitConfig(iterations=1).rate_at(0) == pytest.approx(0.03)
 
 
+def test_pace_lengthens_the_steps_of_vertices():
+    usual = FitConfig(iterations=100)
+    faster = dataclasses.replace(usual, pace=8.0)
+    for iteration in (0, 40, 94):
+        assert faster.motion_rate_at(iteration) == pytest.approx(8.0 * usual.motion_rate_at(iteration))
+    assert faster.motion_rate_at(95) is None
+    assert dataclasses.replace(faster, move=False).motion_rate_at(0) is None
+
+
 @pytest.mark.parametrize("batch", [1, 3, 7])
 def test_every_pass_shows_every_view_once(batch):
     config = FitConfig(batch_views=batch)
@@ -90,6 +100,7 @@ def test_given_backgrounds():
         {"batch_views": 0},
         {"rate": 0.0},
         {"final_rate": float("nan")},
+        {"pace": 0.0},
         {"haze_penalty": -1.0},
         {"initial_color": 2.0},
         {"betas": (0.9, 1.0)},

@@ -62,7 +62,7 @@ class Fit:
             *("background", "device", "config", "resume", "overwrite"),
         ),
         "Mesh": ("start", "grid", "initial-mesh", "repair", "location"),
-        "Motion": ("move", "motion.*"),
+        "Motion": ("move", "pace", "motion.*"),
         "Refinement": ("refine", *(f"{strategy}.*" for strategy in get_args(Refine))),
         "Optimisation": (
             *("loss", "harmonics", "harmonics-rate", "density-rate", "rate", "final-rate", "betas", "batch-views"),

@@ -45,6 +45,7 @@ _STARTS = ("grid", "hull", "points")
 _DEFAULT_CELLS, _DEFAULT_ITERATIONS = 20_000, 2400
 _PHOTO_BANDS, _PHOTO_ITERATIONS = 2, 4800
 _CUT_OUT_DENSITY_RATE = 5.0  # what stands before a background would be put where it is seen first, and stay
+_PHOTO_PACE = 8.0
 _PHOTO_PIXELS_PER_CELL = 12
 _FREE_BEFORE_POINTS, _FREE_BEFORE_BOUNDS = 0.8, 0.5
 _MOST_PHOTO_CELLS = 1_000_000
@@ -56,6 +57,7 @@ _CHOICES_FOR_VOLUMES: dict[str, Any] = {
     "background": "black",
     "harmonics": 0,
     "density_rate": 1.0,
+    "pace": 1.0,
     "free_space": 0.0,
 }
 CHOSEN_FOR_CAPTURE = tuple(_CHOICES_FOR_VOLUMES)
@@ -93,6 +95,9 @@ class FitConfig:
     """Mend an initial mesh that has flat cells or repeated vertices or cells; without it such a mesh is refused."""
     move: bool = True
     """Whether vertices move."""
+    pace: float | None = None
+    """Length of the vertices' steps, in units of that of --motion.rate and its schedule; default: 8 for photographs,
+    whose surfaces are far from where the mesh begins, else 1."""
     refine: Refine = "exchange"
     """How the mesh refines itself: exchange cells at their full number, grow from a coarse mesh, subdivide stars as in
     the article, or not at all."""
@@ -158,7 +163,7 @@ class FitConfig:
         for name, (least, most) in _RANGES.items():
             value = getattr(self, name)
             require(value is None or least <= value <= most, name, value, f"at least {least} and at most {most}")
-        for name in ("rate", "final_rate", "harmonics_rate", "density_rate"):
+        for name in ("rate", "final_rate", "harmonics_rate", "density_rate", "pace"):
             value = getattr(self, name)
             require(value is None or _positive(value), name, value, "greater than 0 and finite")
         for name in ("haze_penalty", "sparsity", "initial_density", "checkpoint_seconds"):
@@ -233,6 +238,7 @@ class FitConfig:
             "background": "random" if capture.is_cut_out else "black",
             "harmonics": _PHOTO_BANDS,
             "density_rate": _CUT_OUT_DENSITY_RATE if capture.is_cut_out else 1.0,
+            "pace": _PHOTO_PACE,
             "free_space": free_space if capture.surroundings > 1.0 else 0.0,
         }
 
@@ -247,7 +253,7 @@ class FitConfig:
     def motion_rate_at(self, iteration: int) -> float | None:
         """Length of the vertices' steps, in altitudes; None where they stay."""
         progress = iteration / (self.motion.until * self.steps)
-        return self.motion.rate_at(progress) if self.move and progress < 1.0 else None
+        return (self.pace or 1.0) * self.motion.rate_at(progress) if self.move and progress < 1.0 else None
 
     def refinement_views_at(self, iteration: int, count: int, view_count: int) -> list[int]:
         """Positions, in [0, view_count), of the random training views that a refinement is judged on.
