@@ -93,10 +93,10 @@ class _Projector:
         sides = (upper - lower) / counts
         # Planes that bound cells are whole numbers: faces of voxels, or their middles.
         begin = -0.5 if linear else 0.0
-        self._table = _view_table(geometry.detector, lower, sides, begin)
+        self._table = view_table(geometry.detector, lower, sides, begin)
         self._ends = (0.0, 1.0) if geometry.detector.source is not None else (-math.inf, math.inf)
         self._size = (geometry.detector.width, geometry.detector.height)
-        self._order = _tiled_order(*self._size)
+        self._order = tiled_order(*self._size)
         stored = volume.permute(2, 1, 0)
         if linear:
             stored = torch.nn.functional.pad(stored[None, None], [1] * 6, mode="replicate")[0, 0]
@@ -130,7 +130,7 @@ class _Projector:
         return b.tensor(output, last - first, order.size).cpu()
 
 
-def _view_table(detector: Detector, lower: np.ndarray, sides: np.ndarray, begin: float) -> np.ndarray:
+def view_table(detector: Detector, lower: np.ndarray, sides: np.ndarray, begin: float) -> np.ndarray:
     """(V, 18) float64 origins and directions of rays in voxels; see the kernel."""
     center, columns, rows = (
         part.detach().cpu().double().numpy() / sides for part in (detector.center, detector.columns, detector.rows)
@@ -147,7 +147,7 @@ def _view_table(detector: Detector, lower: np.ndarray, sides: np.ndarray, begin:
     return np.concatenate(parts, axis=1)
 
 
-def _tiled_order(width: int, height: int) -> np.ndarray:
+def tiled_order(width: int, height: int) -> np.ndarray:
     """(H * W,) uint32 pixels tile by tile, so that rays that run together read the same voxels."""
     row, column = np.divmod(np.arange(width * height, dtype=np.int64), width)
     tile = (row // _TILE) * (width // _TILE + 1) + column // _TILE

@@ -6,6 +6,7 @@ Sources: Siddon, "Fast calculation of the exact radiological path for a three-di
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -66,6 +67,25 @@ class VoxelRays:
     far: Any
 
 
+@dataclass(frozen=True)
+class Piece:
+    """What of a ray is in one cell.
+
+    Attributes:
+        index: Of the cell's value, or of that at its lower corner.
+        walls: Three planes at which the ray would leave the cell.
+        ahead: Three flags, whether it runs towards greater coordinates.
+        begin: Where it enters the cell.
+        end: Where it leaves it.
+    """
+
+    index: Any
+    walls: list[Any]
+    ahead: list[Any]
+    begin: Any
+    end: Any
+
+
 def rays_of(b: Backend, voxels: Voxels, view: list[Any], pixel: tuple[Any, Any], ends: tuple[Any, Any]) -> VoxelRays:
     """Rays to the middles of pixels, cut to the box.
 
@@ -114,6 +134,27 @@ def integrate(b: Backend, voxels: Voxels, rays: VoxelRays, linear: bool) -> Any:
         linear: Whether values are trilinear between the middles of voxels, which the planes run through then, or
             constant in voxels, which they bound.
     """
+
+    def add(total: Any, cell: Piece) -> Any:
+        if linear:
+            mean = _mean(b, voxels, rays, cell)
+        else:
+            mean = dr.gather(b.Float, voxels.values, cell.index)
+        return dr.fma(mean, cell.end - cell.begin, total)
+
+    return walk(b, voxels, rays, add, b.Float(0))
+
+
+def walk(b: Backend, voxels: Voxels, rays: VoxelRays, visit: Callable[[Any, Piece], Any], total: Any) -> Any:
+    """Follow rays from cell to cell, and return what is left of a state.
+
+    Args:
+        b: Back end of the arrays.
+        voxels: The volume.
+        rays: The rays.
+        visit: Takes the state and a ray's piece in a cell, and returns the new state. A piece may have no length.
+        total: The state to begin with, one array.
+    """
     hit = rays.near < rays.far
     start = dr.select(hit, rays.near, 0.0)
     planes, cells, ahead = [], [], []
@@ -137,10 +178,7 @@ def integrate(b: Backend, voxels: Voxels, rays: VoxelRays, linear: bool) -> Any:
         times = [dr.fma(walls[axis], rays.inverse[axis], rays.begin[axis]) for axis in range(3)]
         first = dr.fmin(times[0], dr.fmin(times[1], times[2]))
         end = dr.fmax(t, dr.fmin(first, rays.far))
-        mean = (
-            _mean(b, voxels, rays, index, walls, ahead, t, end) if linear else dr.gather(b.Float, voxels.values, index)
-        )
-        total = dr.fma(mean, end - t, total)
+        total = visit(total, Piece(index, walls, ahead, t, end))
         on_x = times[0] == first
         on_y = ~on_x & (times[1] == first)
         crossed = (on_x, on_y, ~(on_x | on_y))
@@ -151,21 +189,19 @@ def integrate(b: Backend, voxels: Voxels, rays: VoxelRays, linear: bool) -> Any:
             index = dr.select(moves, index + steps[axis], index)
         return dr.select(left, end, rays.far), total, index, walls[0], walls[1], walls[2]
 
-    state = (start, b.Float(0), index, planes[0], planes[1], planes[2])
+    state = (start, total, index, planes[0], planes[1], planes[2])
     return dr.while_loop(state, running, advance, label="integrate_voxels")[1]
 
 
-def _mean(
-    b: Backend, voxels: Voxels, rays: VoxelRays, index: Any, walls: list[Any], ahead: list[Any], begin: Any, end: Any
-) -> Any:
+def _mean(b: Backend, voxels: Voxels, rays: VoxelRays, cell: Piece) -> Any:
     """Mean between two places in a cell of what is trilinear there, and so cubic along the ray."""
     y, z = voxels.strides
     corners = [
-        dr.gather(b.Float, voxels.values, index + shift)
+        dr.gather(b.Float, voxels.values, cell.index + shift)
         for shift in (0, y, z, y + z, b.UInt(1), y + 1, z + 1, y + z + 1)
     ]
-    middle, half = 0.5 * (begin + end), end - begin
-    base = [dr.select(ahead[axis], walls[axis] - 1.0, walls[axis]) for axis in range(3)]
+    middle, half = 0.5 * (cell.begin + cell.end), cell.end - cell.begin
+    base = [dr.select(ahead, wall - 1.0, wall) for ahead, wall in zip(cell.ahead, cell.walls)]
     total = b.Float(0)
     for sign in (-_GAUSS, _GAUSS):
         t = dr.fma(half, sign, middle)
