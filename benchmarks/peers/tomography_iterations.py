@@ -37,10 +37,10 @@ class Sart:
         decay: Of the relaxation, from pass to pass.
     """
 
-    passes: int = 10
-    subsets: int = 9
-    relaxation: float = 1.0
-    decay: float = 0.8
+    passes: int = 6
+    subsets: int = 45
+    relaxation: float = 0.7
+    decay: float = 0.7
 
 
 @dataclass(frozen=True)
@@ -56,9 +56,9 @@ class Variational:
         inner: Steps for the proximal map of the total variation, in each update.
     """
 
-    weight: float = 0.02
-    passes: tuple[int, int] = (8, 6)
-    subsets: int = 9
+    weight: float = 0.025
+    passes: tuple[int, int] = (4, 3)
+    subsets: int = 15
     momentum: float = 0.8
     settling: int = 1
     inner: int = 4
