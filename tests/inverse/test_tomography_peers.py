@@ -1,6 +1,7 @@
 """The voxel reconstructions that benchmarks/peers holds against the meshes: their matrices, and what they recover."""
 
 import dataclasses
+import math
 import sys
 from pathlib import Path
 
@@ -133,3 +134,17 @@ def test_tables_are_kept(peers, tmp_path):
     assert lines[0].split(",") == [field.name for field in dataclasses.fields(peers.Row)]
     assert lines[1] == "FDK,8,512,1.0,2.0,30.0,nan"
     assert peers.table_of(rows, "a scan").row_count == 1
+
+
+def test_the_phantom_holds_its_bodies(monkeypatch):
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
+    phantom = __import__("phantom")
+    sys.modules.pop("phantom")
+    half = (0.5, 0.3, 0.2)
+    plate = phantom.Body(2.0, (0.1, 0.0, -0.1), half, is_plate=True, turn=30, tilt=40)
+    ellipsoid = phantom.Body(0.5, (0.1, 0.0, -0.1), half, turn=30, tilt=40)
+    voxel = (2 / 24) ** 3
+    assert phantom.phantom(24, (plate,)).sum() * voxel == pytest.approx(2.0 * 8 * 0.03, rel=0.01)
+    assert phantom.phantom(24, (ellipsoid,)).sum() * voxel == pytest.approx(0.5 * 4 / 3 * math.pi * 0.03, rel=0.01)
+    both = phantom.phantom(24, (plate, ellipsoid))
+    assert both[13, 12, 10] == 0.5 and both.max() == 2.0 and phantom.phantom(24).max() <= phantom.METAL
