@@ -18,7 +18,7 @@ PAGES = sorted(page for page in DOCS.rglob("*.md") if not {"_build", "gallery"} 
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *PAGES]
 TEXTS = {str(document.relative_to(ROOT)): document.read_text(encoding="utf-8") for document in DOCUMENTS}
 API = "".join(text for name, text in TEXTS.items() if name.startswith("docs/api"))
-PUBLIC = ("", ".mesh", ".mesh.io", ".optics", ".rendering", ".sampling", ".capture", ".fitting", ".view")
+PUBLIC = ("", ".mesh", ".mesh.io", ".optics", ".rendering", ".sampling", ".capture", ".fitting", ".inverse", ".view")
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT / "src"), "OMP_NUM_THREADS": "1"}
 
 # What a page takes for granted: here a folder of photographs called garden.
@@ -61,7 +61,7 @@ def shown_commands() -> list:
     for name, text in TEXTS.items():
         scripts = re.findall(r"^```sh\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
         lines = [line for script in scripts for line in script.replace("\\\n", " ").splitlines()]
-        lines += [" ".join(code.split()) for code in re.findall(r"(?<!`)`(difftetvr [a-z]+ [^`]+)`(?!`)", text)]
+        lines += [" ".join(code.split()) for code in re.findall(r"(?<!`)`(difftetvr [a-z-]+ [^`]+)`(?!`)", text)]
         for line in lines:
             words = shlex.split(line, comments=True)
             if words[:1] == ["difftetvr"] and "..." not in words:
@@ -88,7 +88,7 @@ def test_commands_can_be_given_as_shown(words, tmp_path, monkeypatch, capsys):
 def test_every_command_is_in_the_table_of_commands():
     from difftetvr.cli import COMMANDS
 
-    assert set(COMMANDS) == set(re.findall(r"^\| `(\w+)[ `]", TEXTS["docs/command-line.md"], re.MULTILINE))
+    assert set(COMMANDS) == set(re.findall(r"^\| `([\w-]+)[ `]", TEXTS["docs/command-line.md"], re.MULTILINE))
 
 
 def test_every_name_can_be_reached_from_the_package():

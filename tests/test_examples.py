@@ -66,6 +66,12 @@ def test_recover_pose(run, tmp_path):
     assert (tmp_path / "out" / "examples" / "recover_pose.png").exists()
 
 
+def test_best_viewpoint(run, tmp_path):
+    output = run("best_viewpoint", tmp_path)
+    assert last_number(output, r"Entropy ([\d.]+)") > last_number(output, r"scouts ([\d.]+)")
+    assert (tmp_path / "viewpoint_map.png").stat().st_size > 10_000
+
+
 def test_own_training_loop(run):
     output = run("own_training_loop")
     assert last_number(output, r"PSNR ([\d.]+)") > 22.0

@@ -27,6 +27,7 @@ from .errors import MeshError as MeshError
 from .fitting.config import FitConfig as FitConfig
 from .fitting.loop import fit as fit
 from .fitting.records.result import FitResult as FitResult
+from .inverse.viewpoint.search import best_viewpoint as best_viewpoint
 from .mesh.field import Field as Field
 from .mesh.io.loading import MeshData as MeshData
 from .mesh.io.loading import load as load
@@ -85,6 +86,7 @@ __all__ = [
     "Volume",
     "VolumeCapture",
     "__version__",
+    "best_viewpoint",
     "depth_at",
     "fit",
     "isosurface",

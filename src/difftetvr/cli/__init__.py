@@ -33,6 +33,7 @@ COMMANDS = {
     "render": "render.Render",
     "compare": "pictures.Compare",
     "cut": "pictures.Cut",
+    "viewpoint": "inverse.viewpoint.Viewpoint",
     "eval": "files.Eval",
     "info": "files.Info",
     "export": "export.command.Export",

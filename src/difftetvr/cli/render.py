@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 # Where the default camera stands, seen from the mesh: in front, to the right, a little above.
 _DEFAULT_DIRECTION = (0.45, -1.0, 0.35)
+_DEFAULT_UP, _DEFAULT_FOV, _DEFAULT_SIZE = (0.0, 0.0, 1.0), 53.13, 512
 _WORST_SHOWN = 1e-3
 _LEAST_SIZE, _MOST_SIZE = 1e-150, 1e150  # of meshes, so that squares of lengths are numbers
 
@@ -100,18 +101,21 @@ class Render:
     """Mesh (.vtu, .vtk, .msh, .mesh, .xdmf, .npz, .bintet, .ovm, .node) with color and density, or with scalars."""
     output: Output
     """The picture, .png."""
+    camera: Path | None = None
+    """File of the camera, .json, such as viewpoint writes it, instead of the following options; with --width its
+    picture in that size."""
     eye: tuple[float, float, float] | None = None
     """Position of the camera; default: far enough away that the whole mesh is seen."""
     target: tuple[float, float, float] | None = None
     """Point in the middle of the picture; default: the centre of the mesh."""
-    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    """Direction that points upwards in the picture."""
-    fov: float = 53.13
-    """Vertical field of view in degrees."""
-    width: int = 512
-    """Pixels."""
-    height: int = 512
-    """Pixels."""
+    up: tuple[float, float, float] | None = None
+    """Direction that points upwards in the picture; default: 0 0 1."""
+    fov: float | None = None
+    """Vertical field of view in degrees; default: 53.13."""
+    width: int | None = None
+    """Pixels; default: 512, or as the camera's file says."""
+    height: int | None = None
+    """Pixels; default: likewise."""
     background: Color = "black"
     """Behind the volume: black, white or linear R G B."""
     clip: tuple[float, float, float, float] | None = None
@@ -126,7 +130,7 @@ class Render:
     mesh: OmitArgPrefixes[MeshOptions] = field(default_factory=MeshOptions)
     trust: OmitArgPrefixes[TrustOptions] = field(default_factory=TrustOptions)
     groups: ClassVar[Groups] = {
-        "Camera": ("eye", "target", "up", "fov", "width", "height"),
+        "Camera": ("camera", "eye", "target", "up", "fov", "width", "height"),
         "Scalars of a simulation": ("scalar", "transfer-function", "value-range", "attenuation"),
         "How it is drawn": ("background", "clip", "show", "renderer", "split", "step", "device"),
         **TRUST_GROUPS,
@@ -171,7 +175,7 @@ class Render:
         if (reason := why_blank(mesh, content, camera, image, background, renderer, self.clip)) is not None:
             console.print(reason, highlight=False)
         what = "" if shown.name is None else f", {shown.name}"
-        console.print(f"Wrote {self.output} ({self.width} x {self.height}{what})", highlight=False)
+        console.print(f"Wrote {self.output} ({camera.width} x {camera.height}{what})", highlight=False)
 
     def _draw_statistics(self, mesh: TetMesh, defects: Defects, console: Console) -> None:
         from difftetvr.rendering.inspection import inspect_rays
@@ -196,15 +200,39 @@ class Render:
         return self.renderer or ("linked-list" if overlaps else "marching")
 
     def _require_valid_camera(self) -> None:
-        if not 0.0 < self.fov < 180.0:
+        if self.fov is not None and not 0.0 < self.fov < 180.0:
             raise CameraError(f"--fov is {self.fov:g} degrees; it must lie between 0 and 180.")
         for name in ("eye", "target", "up"):
             values = getattr(self, name)
             if values is not None and not all(math.isfinite(v) for v in values):
                 given = " ".join(f"{v:g}" for v in values)
                 raise CameraError(f"--{name} is {given}; give three finite numbers.")
+        placed = [name for name in ("eye", "target", "up", "fov") if getattr(self, name) is not None]
+        if self.camera is not None and placed:
+            raise CameraError(f"--camera {self.camera} says where the camera is; leave out --{placed[0]}.")
 
     def _camera(self, mesh: TetMesh) -> Camera:
+        from difftetvr.rendering.cameras.camera_file import load_camera
+
+        if self.camera is not None:
+            return self._resized(load_camera(self.camera))
+        return self._placed(mesh)
+
+    def _resized(self, camera: Camera) -> Camera:
+        """A camera from a file, in the size that is asked for."""
+        if self.width is None and self.height is None:
+            return camera
+        width = self.width or round(camera.width * (self.height or 0) / camera.height)
+        height = self.height or round(camera.height * width / camera.width)
+        # To a pixel: other proportions would squeeze the picture.
+        if abs(width * camera.height - height * camera.width) > max(camera.width, camera.height):
+            raise CameraError(
+                f"The camera {self.camera} takes pictures of {camera.width} x {camera.height} pixels, which "
+                f"{width} x {height} would squeeze; give one of --width and --height."
+            )
+        return camera.with_size(width, height)
+
+    def _placed(self, mesh: TetMesh) -> Camera:
         import torch
 
         from difftetvr.rendering.cameras.pinhole import Camera
@@ -215,12 +243,13 @@ class Render:
             raise MeshError(
                 f"{self.model} is {size:.3g} across, of which no picture can be computed; scale its positions."
             )
+        width, height = (_DEFAULT_SIZE if pixels is None else pixels for pixels in (self.width, self.height))
         target = torch.tensor(self.target, dtype=torch.float64) if self.target else 0.5 * (lower + upper)
         eye = torch.tensor(self.eye, dtype=torch.float64) if self.eye else None
-        fov_y = math.radians(self.fov)
+        fov_y = math.radians(_DEFAULT_FOV if self.fov is None else self.fov)
         if eye is None:
             direction = torch.tensor(_DEFAULT_DIRECTION, dtype=torch.float64)
-            narrow = 2.0 * math.atan(math.tan(0.5 * fov_y) * min(1.0, self.width / max(self.height, 1)))
+            narrow = 2.0 * math.atan(math.tan(0.5 * fov_y) * min(1.0, width / max(height, 1)))
             radius = 0.5 * (upper - lower).norm()
             eye = target + radius / max(math.sin(0.5 * narrow), 1e-6) * direction / direction.norm()
-        return Camera.look_at(eye, target, self.up, fov_y, self.width, self.height)
+        return Camera.look_at(eye, target, self.up or _DEFAULT_UP, fov_y, width, height)

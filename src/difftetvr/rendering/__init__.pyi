@@ -15,6 +15,8 @@ from . import tracers as tracers
 from . import traversal as traversal
 from .api import RenderedImage as RenderedImage
 from .api import render as render
+from .cameras.camera_file import load_camera as load_camera
+from .cameras.camera_file import save_camera as save_camera
 from .cameras.detector import Detector as Detector
 from .cameras.lens import LensCamera as LensCamera
 from .cameras.panoramic import PanoramicCamera as PanoramicCamera
@@ -42,7 +44,9 @@ __all__ = [
     "RenderedImage",
     "ScalarField",
     "depth_at",
+    "load_camera",
     "render",
     "render_normals",
+    "save_camera",
     "transmittance_at",
 ]

@@ -6,6 +6,7 @@ from . import heatmap as heatmap
 from . import pictures as pictures
 from . import plots as plots
 from . import report as report
+from . import viewpoints as viewpoints
 from .pictures import save_png as save_png
 
 __all__ = ["save_png"]

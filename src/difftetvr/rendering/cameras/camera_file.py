@@ -1,0 +1,83 @@
+"""Single pinhole cameras as files.
+
+    {
+      "format": "difftetvr-camera",
+      "world_to_camera": [[...], [...], [...], [0, 0, 0, 1]],
+      "fx": 500.0, "fy": 500.0, "cx": 320.0, "cy": 240.0,
+      "width": 640, "height": 480
+    }
+
+Axes are OpenCV's, focal lengths and principal points in pixels, as everywhere.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from difftetvr.errors import CameraError
+from difftetvr.files import atomic_write
+from difftetvr.inputs import require_type
+from difftetvr.rendering.cameras.pinhole import Camera
+from difftetvr.trust import require_regular
+
+CAMERA_FORMAT = "difftetvr-camera"
+_NUMBERS = ("fx", "fy", "cx", "cy")
+_SIZES = ("width", "height")
+
+
+def save_camera(path: str | Path, camera: Camera) -> None:
+    """Writes a camera as JSON that :func:`load_camera`, and ``difftetvr render --camera``, read back to the bit.
+
+    Args:
+        path: File to write.
+        camera: A pinhole camera, without a lens.
+
+    Raises:
+        CameraError: It is another camera, or the file cannot be written.
+    """
+    if type(camera) is not Camera:
+        raise CameraError("Only pinhole cameras are saved one by one; save the capture of others.")
+    content: dict[str, Any] = {"format": CAMERA_FORMAT}
+    content["world_to_camera"] = camera.world_to_camera.detach().cpu().double().tolist()
+    content |= {name: getattr(camera, name) for name in (*_NUMBERS, *_SIZES)}
+    with atomic_write(path, CameraError) as temporary:
+        Path(temporary).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+
+def load_camera(path: str | Path) -> Camera:
+    """Reads a camera that :func:`save_camera` wrote.
+
+    Args:
+        path: The file.
+
+    Raises:
+        CameraError: The file is missing, no camera, or one of its values is not valid.
+    """
+    require_type(path, (str, Path), "The file of the camera", "pass its path", CameraError)
+    require_regular(Path(path), CameraError)
+    try:
+        content = json.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise CameraError(f"Cannot read the camera '{path}': {error.strerror or error}.") from None
+    except (ValueError, RecursionError):
+        raise CameraError(f"The camera '{path}' is not valid JSON; give a file that save_camera wrote.") from None
+    if not isinstance(content, dict) or content.get("format") != CAMERA_FORMAT:
+        raise CameraError(f"'{path}' does not have the format '{CAMERA_FORMAT}'; give a file that save_camera wrote.")
+    missing = [name for name in ("world_to_camera", *_NUMBERS, *_SIZES) if name not in content]
+    if missing:
+        raise CameraError(f"The camera '{path}' has no '{missing[0]}'; give a file that save_camera wrote.")
+    try:
+        pose = torch.tensor(content["world_to_camera"], dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        raise CameraError(f"'world_to_camera' of the camera '{path}' is no matrix of numbers; correct it.") from None
+    single = pose.float()
+    if torch.equal(single.double(), pose):
+        pose = single
+    try:
+        return Camera(pose, *(content[name] for name in (*_NUMBERS, *_SIZES)))
+    except CameraError as error:
+        raise CameraError(f"The camera '{path}' is not valid: {error}") from None
