@@ -27,6 +27,7 @@ from .errors import MeshError as MeshError
 from .fitting.config import FitConfig as FitConfig
 from .fitting.loop import fit as fit
 from .fitting.records.result import FitResult as FitResult
+from .inverse.transfer.fit import fit_transfer as fit_transfer
 from .inverse.viewpoint.search import best_viewpoint as best_viewpoint
 from .mesh.field import Field as Field
 from .mesh.io.loading import MeshData as MeshData
@@ -89,6 +90,7 @@ __all__ = [
     "best_viewpoint",
     "depth_at",
     "fit",
+    "fit_transfer",
     "isosurface",
     "load",
     "load_capture",

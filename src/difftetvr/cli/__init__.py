@@ -33,6 +33,7 @@ COMMANDS = {
     "render": "render.Render",
     "compare": "pictures.Compare",
     "cut": "pictures.Cut",
+    "fit-transfer": "inverse.fit_transfer.FitTransfer",
     "viewpoint": "inverse.viewpoint.Viewpoint",
     "eval": "files.Eval",
     "info": "files.Info",

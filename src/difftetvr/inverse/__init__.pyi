@@ -1,5 +1,11 @@
 from . import tomography as tomography
+from . import transfer as transfer
 from . import viewpoint as viewpoint
+from .transfer.config import TransferConfig as TransferConfig
+from .transfer.fit import TransferProgress as TransferProgress
+from .transfer.fit import TransferResult as TransferResult
+from .transfer.fit import fit_transfer as fit_transfer
+from .transfer.volumes import volume_on_grid as volume_on_grid
 from .viewpoint.entropy import color_entropy as color_entropy
 from .viewpoint.entropy import opacity_entropy as opacity_entropy
 from .viewpoint.entropy import reference_colors as reference_colors
@@ -10,12 +16,17 @@ from .viewpoint.search import best_viewpoint as best_viewpoint
 from .viewpoint.search import sample_viewpoints as sample_viewpoints
 
 __all__ = [
+    "TransferConfig",
+    "TransferProgress",
+    "TransferResult",
     "Viewpoint",
     "ViewpointConfig",
     "ViewpointSearch",
     "best_viewpoint",
     "color_entropy",
+    "fit_transfer",
     "opacity_entropy",
     "reference_colors",
     "sample_viewpoints",
+    "volume_on_grid",
 ]

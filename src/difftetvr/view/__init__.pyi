@@ -6,6 +6,7 @@ from . import heatmap as heatmap
 from . import pictures as pictures
 from . import plots as plots
 from . import report as report
+from . import transfer_report as transfer_report
 from . import viewpoints as viewpoints
 from .pictures import save_png as save_png
 

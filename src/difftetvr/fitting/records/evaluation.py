@@ -14,7 +14,7 @@ from difftetvr.capture.truth import BLACK, WHITE, Color, Truth
 from difftetvr.fitting.metrics import SSIM_WINDOW, psnr, ssim
 from difftetvr.mesh.field import Field
 from difftetvr.mesh.tetmesh import TetMesh
-from difftetvr.rendering import render
+from difftetvr.rendering import ScalarField, render
 
 
 @dataclass(frozen=True)
@@ -90,19 +90,21 @@ def valid_share(capture: Capture, view: int) -> float:
     return _on_host(capture).share(view)
 
 
-def rendered_image(mesh: TetMesh, field: Field, capture: Capture, view: int, background: Color = BLACK) -> torch.Tensor:
+def rendered_image(
+    mesh: TetMesh, field: Field | ScalarField, capture: Capture, view: int, background: Color = BLACK
+) -> torch.Tensor:
     """(H, W, 3) image of the reconstruction from the camera of a view, on the CPU."""
     return _rendered(mesh, field, _on_host(capture), view, background).cpu()
 
 
 def evaluate(
-    mesh: TetMesh, field: Field, capture: Capture, views: Sequence[int], background: Color = BLACK
+    mesh: TetMesh, field: Field | ScalarField, capture: Capture, views: Sequence[int], background: Color = BLACK
 ) -> Evaluation:
     """Renders views and compares them with the truth, where the mesh is.
 
     Args:
         mesh: The reconstruction's mesh, on any device.
-        field: Its colours and densities.
+        field: Its colours and densities, or scalars.
         capture: Cameras and true images.
         views: Indices of the views to compare; those without any valid pixel are left out.
         background: Linear RGB behind the volume.
@@ -110,7 +112,9 @@ def evaluate(
     return compared(mesh, field, Truth(capture, mesh.vertices.device), views, background)
 
 
-def compared(mesh: TetMesh, field: Field, truth: Truth, views: Sequence[int], background: Color = BLACK) -> Evaluation:
+def compared(
+    mesh: TetMesh, field: Field | ScalarField, truth: Truth, views: Sequence[int], background: Color = BLACK
+) -> Evaluation:
     """What :func:`evaluate` returns, of a capture whose views are known already."""
     psnrs, ssims = [], []
     views = [view for view in views if truth.share(view) > 0.0]
@@ -125,7 +129,7 @@ def compared(mesh: TetMesh, field: Field, truth: Truth, views: Sequence[int], ba
 
 
 @torch.no_grad()
-def _rendered(mesh: TetMesh, field: Field, truth: Truth, view: int, background: Color) -> torch.Tensor:
+def _rendered(mesh: TetMesh, field: Field | ScalarField, truth: Truth, view: int, background: Color) -> torch.Tensor:
     return render(mesh, field, truth.camera(view), background=torch.tensor(background)).color
 
 
