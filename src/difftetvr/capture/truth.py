@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import torch
@@ -36,6 +36,7 @@ class Truth:
     Attributes:
         capture: Where the views come from.
         device: Where images and masks are.
+        cameras: Cameras of views by their index, where they are not those of the capture.
     """
 
     def __init__(self, capture: Capture, device: torch.device) -> None:
@@ -47,6 +48,7 @@ class Truth:
         """
         self.capture = capture
         self.device = device if device.type == "cuda" else torch.device("cpu")
+        self.cameras: Callable[[int], Camera] | None = None
         self._kept: dict[int, _View] = {}
         self._last: tuple[int, _View] | None = None
         self._shares: dict[int, float] = {}
@@ -99,11 +101,16 @@ class Truth:
 
     def camera(self, view: int) -> Camera:
         """What to render a view with: rays that kernels do not make themselves are made on the device."""
+        if self.cameras is not None:
+            return self.cameras(view)
         camera = self.capture.cameras[view]
         return camera if type(camera) is Camera else self._view(view).camera
 
     def rays(self, view: int) -> Rays:
         """The rays of all pixels of a view."""
+        if self.cameras is not None:
+            camera = self.cameras(view)
+            return camera.with_pose(camera.world_to_camera.to(self.device)).rays()
         return self._view(view).camera.rays()
 
     def _view(self, view: int) -> _View:

@@ -68,6 +68,7 @@ class Fit:
             *("loss", "harmonics", "harmonics-rate", "density-rate", "rate", "final-rate", "betas", "batch-views"),
             *("haze-penalty", "free-space", "sparsity", "initial-color", "initial-density", "seed", "deterministic"),
         ),
+        "Cameras that are not known well": ("refine-poses", "refine-intrinsics", "cameras.*"),
         **CAPTURE_GROUPS,
         "Output": ("evaluate-every", "checkpoint-seconds"),
     }

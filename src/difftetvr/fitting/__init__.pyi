@@ -1,4 +1,5 @@
 from . import beginning as beginning
+from . import cameras as cameras
 from . import config as config
 from . import loop as loop
 from . import losses as losses
@@ -12,6 +13,8 @@ from . import records as records
 from . import refinement as refinement
 from . import regularizers as regularizers
 from . import trainer as trainer
+from .cameras.options import CameraRefinement as CameraRefinement
+from .cameras.refined import RefinedCameras as RefinedCameras
 from .config import FitConfig as FitConfig
 from .loop import fit as fit
 from .motion import Motion as Motion
@@ -35,6 +38,7 @@ from .regularizers import shape_barrier as shape_barrier
 from .regularizers import softplus_regularizer as softplus_regularizer
 
 __all__ = [
+    "CameraRefinement",
     "Evaluation",
     "Exchange",
     "FitConfig",
@@ -45,6 +49,7 @@ __all__ = [
     "Processes",
     "Progress",
     "ProgressDisplay",
+    "RefinedCameras",
     "Refinement",
     "Situation",
     "Star",

@@ -11,6 +11,7 @@ import numpy as np
 
 from difftetvr.declared import require_declared
 from difftetvr.errors import FitError
+from difftetvr.fitting.cameras.options import CameraRefinement
 from difftetvr.fitting.motion import Motion
 from difftetvr.fitting.options import LARGEST_COUNT, first_difference, options_from_json, require
 from difftetvr.fitting.refinement import Exchange, Grow, Star, Strategy
@@ -149,6 +150,12 @@ class FitConfig:
     """Iterations between glances at a few held-out views, for the curves only; 0: never."""
     checkpoint_seconds: float = 30.0
     """Seconds between checkpoints."""
+    refine_poses: bool = False
+    """Whether the cameras' poses are unknowns, too: for photographs whose poses are off by a pixel or more."""
+    refine_intrinsics: bool = False
+    """Whether the focal length and the principal point are, one change for all views."""
+    cameras: CameraRefinement = field(default_factory=CameraRefinement)
+    """How they move."""
     motion: Motion = field(default_factory=Motion)
     """How vertices move."""
     exchange: Exchange = field(default_factory=Exchange)
@@ -241,6 +248,11 @@ class FitConfig:
             "pace": _PHOTO_PACE,
             "free_space": free_space if capture.surroundings > 1.0 else 0.0,
         }
+
+    @property
+    def refines_cameras(self) -> bool:
+        """Whether any part of the cameras is unknown."""
+        return self.refine_poses or self.refine_intrinsics
 
     def bands_at(self, iteration: int) -> int:
         """Bands of the harmonics that take part in a step: they are switched on one after the other."""

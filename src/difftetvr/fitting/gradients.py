@@ -9,6 +9,7 @@ from operator import add
 import torch
 
 from difftetvr.capture.truth import Color, Truth
+from difftetvr.fitting.cameras.refined import RefinedCameras
 from difftetvr.fitting.config import FitConfig
 from difftetvr.fitting.losses import LOSSES, sparsity
 from difftetvr.fitting.parameters import FieldParameters
@@ -26,12 +27,14 @@ class ViewGradients:
         config: Options, chosen for the capture.
         parameters: Colours and densities; their gradients are gathered in them.
         processes: Those that take the views.
+        cameras: Where the cameras are refined: their gradients are gathered in them.
     """
 
     truth: Truth
     config: FitConfig
     parameters: FieldParameters
     processes: Processes
+    cameras: RefinedCameras | None = None
 
     def gather(self, mesh: TetMesh, views: list[int], iteration: int) -> list[torch.Tensor]:
         """Gradients of the mean loss over views: new ones of the field, and added to those of the vertices.
@@ -46,6 +49,7 @@ class ViewGradients:
         """
         leaves = self.parameters.leaves(self.config.bands_at(iteration))
         leaves += [mesh.vertices] if mesh.vertices.requires_grad else []
+        leaves += [] if self.cameras is None else self.cameras.leaves()
         before = mesh.vertices.grad  # of earlier iterations, in which all processes have a part already
         for leaf in leaves:
             leaf.grad = None
@@ -82,7 +86,7 @@ class ViewGradients:
         image = render(
             mesh,
             self.parameters.field(self.config.bands_at(iteration)),
-            self.truth.camera(view),
+            self.truth.camera(view) if self.cameras is None else self.cameras.camera(view),
             background=torch.tensor(background),
             deterministic=self.config.deterministic,
         ).color

@@ -140,9 +140,11 @@ def optimise(
     """
     with one_torch_thread():
         iterate(trainer, path, on_progress)
-        evaluation = trainer.evaluate(trainer.capture.test_indices.tolist())
+        tested: list[int] = trainer.capture.test_indices.tolist()
+        trainer.align(tested)
+        evaluation = trainer.evaluate(tested)
     field = trainer.parameters.detached_field()
-    return FitResult(trainer.mesh, field, evaluation, trainer.history, trainer.config)
+    return FitResult(trainer.mesh, field, evaluation, trainer.history, trainer.config, trainer.cameras)
 
 
 def _require_kinds(capture: object, config: object, mesh: object, strategy: object, on_progress: object) -> None:

@@ -13,6 +13,8 @@ from difftetvr.errors import DiffTetError
 from difftetvr.fitting.beginning.initial_mesh import Start, load_start
 from difftetvr.fitting.beginning.requirements import device_for, require_fittable
 from difftetvr.fitting.beginning.starting_mesh import starting_mesh
+from difftetvr.fitting.cameras.alignment import align_held_out
+from difftetvr.fitting.cameras.refined import RefinedCameras
 from difftetvr.fitting.config import FitConfig
 from difftetvr.fitting.gradients import ViewGradients
 from difftetvr.fitting.parameters import FieldParameters
@@ -31,7 +33,7 @@ from difftetvr.rendering.gauss_newton import ImageModel
 _GLANCE_VIEWS = 4
 _READ_EVERY = 25
 """Iterations from one question to a GPU how they went to the next: the host waits for each answer."""
-_POSITIONS = "positions."  # prefix of the positions' state in a checkpoint
+_POSITIONS, _CAMERAS = "positions.", "cameras."  # prefixes of their states in a checkpoint
 
 
 class Trainer:
@@ -44,6 +46,7 @@ class Trainer:
         budget: Cells that the mesh may have.
         parameters: Colours and densities under optimisation.
         positions: Vertex positions under optimisation; None where they are fixed.
+        cameras: Cameras under optimisation; None where they are known.
         iteration: Iterations done.
         history: What happened so far; on a GPU it may lack the latest iterations, see :meth:`catch_up`.
         repair: What mending the initial mesh changed, in words; None where it was not mended.
@@ -96,7 +99,9 @@ class Trainer:
         self._unread = Unread()
         self._train_views: list[int] = capture.train_indices.tolist()
         self._truth = Truth(capture, self._mesh.vertices.device).keep(self._train_views + self._glanced_views())
-        self._gradients = ViewGradients(self._truth, config, self.parameters, processes)
+        self.cameras = _cameras(capture, config)
+        self._truth.cameras = None if self.cameras is None else self.cameras.known
+        self._gradients = ViewGradients(self._truth, config, self.parameters, processes, self.cameras)
         self._capture_description = describe_capture(capture)
 
     @property
@@ -137,6 +142,8 @@ class Trainer:
             self._unread.read_errors(self.history)
         self.parameters.step(self.config.rate_at(self.iteration), self.config.haze_penalty)
         self._move(rate)
+        if self.cameras is not None:
+            self.cameras.step(batch, self.iteration / self.config.steps)
         if is_read:
             self._unread.read_moves(self.history)
         self.iteration += 1
@@ -156,6 +163,14 @@ class Trainer:
         mesh, field, background = self.mesh, self.parameters.detached_field(), self.config.evaluation_background()
         own = [compared(mesh, field, self._truth, [view], background).row for view in self.processes.share(views)]
         return Evaluation.of_rows(self.processes.gathered(own, len(views), 3))
+
+    def align(self, views: list[int]) -> None:
+        """Moves held-out cameras to where their images fit best, where cameras are refined."""
+        if self.cameras is None or not self.config.refine_poses:
+            return
+        field, options = self.parameters.detached_field(), self.config.cameras
+        background = self.config.evaluation_background()
+        align_held_out(self.cameras, options, self.mesh, field, self._truth, views, background, self.processes)
 
     def require_agreement(self) -> None:
         """Checks that all processes have come to the same state.
@@ -181,6 +196,8 @@ class Trainer:
         if self.positions:
             state = self.positions.state()
             tensors |= {_POSITIONS + name: tensor for name, tensor in state.items() if name not in tensors}
+        if self.cameras is not None:
+            tensors |= {_CAMERAS + name: tensor for name, tensor in self.cameras.state().items()}
         strategy = type(self.strategy).__name__
         return Checkpoint(
             self.iteration,
@@ -221,6 +238,8 @@ class Trainer:
         trainer.parameters.restore(checkpoint.tensors)
         if trainer.positions:
             trainer.positions.restore({k.removeprefix(_POSITIONS): v for k, v in checkpoint.tensors.items()})
+        if trainer.cameras is not None:
+            trainer.cameras.restore({k.removeprefix(_CAMERAS): v for k, v in checkpoint.tensors.items()})
         trainer.budget = checkpoint.budget
         trainer.iteration = checkpoint.iteration
         trainer.history = checkpoint.history
@@ -365,3 +384,9 @@ def _start(capture: Capture, config: FitConfig, strategy: Strategy | None, mesh:
     if config.initial_mesh is not None:
         return load_start(capture, config, strategy)
     return Start(starting_mesh(capture, config, strategy))
+
+
+def _cameras(capture: Capture, config: FitConfig) -> RefinedCameras | None:
+    if not config.refines_cameras:
+        return None
+    return RefinedCameras(capture, config.cameras, config.refine_poses, config.refine_intrinsics)

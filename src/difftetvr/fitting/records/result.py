@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from difftetvr.fitting.cameras.refined import RefinedCameras
 from difftetvr.fitting.config import FitConfig
 from difftetvr.fitting.records.evaluation import Evaluation
 from difftetvr.fitting.records.history import History, MoveTotals, RefinementRecord
@@ -53,6 +54,7 @@ class FitResult:
         evaluation: Image quality on each held-out view.
         history: Loss and PSNR per iteration.
         config: Options that it was made with.
+        refined: Cameras as they were found, ``refined.cameras()``, where they were unknown; else None.
     """
 
     mesh: TetMesh
@@ -60,6 +62,7 @@ class FitResult:
     evaluation: Evaluation
     history: History
     config: FitConfig
+    refined: RefinedCameras | None = None
 
     @property
     def metrics(self) -> dict[str, Any]:
@@ -79,4 +82,5 @@ class FitResult:
             "moves": asdict(self.history.moves),
             "refinements": [{**asdict(r), "achieved": r.achieved} for r in self.history.refinements],
             "seconds": self.history.seconds,
+            **({} if self.refined is None else {"cameras": self.refined.summary()}),
         }

@@ -1,0 +1,91 @@
+"""Fits of photographs whose poses are off, with and without their refinement, beside one with true poses.
+
+Every camera is turned by --degrees about a random axis and shifted by --shift of its distance from the middle of the
+box, in a random direction; held-out views, too. They are compared at poses that were found on their own images, as in
+BARF; with true poses as they are.
+
+    python benchmarks/poses.py ../shared/data/lego --downscale 8 [--iterations 2400] [--cells 40000]
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import math
+
+import torch
+
+import difftetvr as dtv
+from difftetvr.fitting.cameras.refined import rotation_of
+
+
+def disturbed(capture: dtv.Capture, degrees: float, shift: float, seed: int = 0) -> dtv.Capture:
+    """The capture with poses that are off."""
+    random = torch.Generator().manual_seed(seed)
+    center = capture.bounds.double().mean(0)
+    cameras = []
+    for camera in capture.cameras:
+        axis, along = torch.randn(2, 3, generator=random, dtype=torch.float64)
+        pose = camera.world_to_camera.double()
+        eye = camera.position.double()
+        moved = eye + shift * (eye - center).norm() * along / along.norm()
+        rotation = rotation_of(math.radians(degrees) * axis / axis.norm()) @ pose[:3, :3]
+        wrong = torch.eye(4, dtype=torch.float64)
+        wrong[:3, :3], wrong[:3, 3] = rotation, -rotation @ moved
+        cameras.append(camera.with_pose(wrong.to(camera.world_to_camera)))
+    return dataclasses.replace(capture, cameras=cameras)
+
+
+def pose_errors(found: list[dtv.Camera], true: list[dtv.Camera], views: list[int]) -> tuple[float, float]:
+    """Mean errors of directions in degrees and of positions in parts of the distance, after a similarity transform."""
+    a, b = (torch.stack([cameras[v].position.double() for v in views]) for cameras in (found, true))
+    middle_a, middle_b = a.mean(0), b.mean(0)
+    left, sizes, right = torch.linalg.svd((b - middle_b).T @ (a - middle_a))
+    flip = torch.diag(torch.tensor([1.0, 1.0, float(torch.sign(torch.det(left @ right)))], dtype=torch.float64))
+    rotation = left @ flip @ right
+    scale = (sizes * flip.diagonal()).sum() / (a - middle_a).square().sum()
+    places = scale * (a - middle_a) @ rotation.T + middle_b
+    angles = []
+    for v in views:
+        turned = found[v].world_to_camera[:3, :3].double() @ rotation.T
+        cosine = ((turned @ true[v].world_to_camera[:3, :3].double().T).trace() - 1.0) / 2.0
+        angles.append(math.degrees(math.acos(min(1.0, float(cosine)))))
+    distance = (b - middle_b).norm(dim=1).mean()
+    return sum(angles) / len(angles), float((places - b).norm(dim=1).mean() / distance)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("capture")
+    parser.add_argument("--downscale", type=int, default=8)
+    parser.add_argument("--iterations", type=int, default=2400)
+    parser.add_argument("--cells", type=int, default=40_000)
+    parser.add_argument("--degrees", type=float, default=0.5)
+    parser.add_argument("--shift", type=float, default=0.01)
+    parser.add_argument("--rates", nargs="+", type=float, default=[2e-3])
+    parser.add_argument("--only-refined", action="store_true")
+    options = parser.parse_args()
+    capture = dtv.load_capture(options.capture, downscale=options.downscale)
+    off = disturbed(capture, options.degrees, options.shift)
+    plain = dtv.FitConfig(cells=options.cells, iterations=options.iterations, evaluate_every=0)
+    refined = [
+        dataclasses.replace(
+            plain, refine_poses=True, cameras=dtv.fitting.CameraRefinement(rate=rate, final_rate=0.1 * rate)
+        )
+        for rate in options.rates
+    ]
+    rows = [("true", capture, plain), ("off, as given", off, plain)] if not options.only_refined else []
+    rows += [(f"off, refined at {config.cameras.rate:g}", off, config) for config in refined]
+    training = capture.train_indices.tolist()
+    print("| poses | PSNR, dB | SSIM | off by, degrees | off by, % of the distance | s |\n|---|---|---|---|---|---|")
+    for name, images, config in rows:
+        result = dtv.fit(images, config)
+        found = images.cameras if result.refined is None else result.refined.cameras()
+        angle, place = pose_errors(found, capture.cameras, training)
+        psnr, ssim = result.evaluation.mean_psnr, result.evaluation.mean_ssim
+        seconds = result.history.seconds
+        print(f"| {name} | {psnr:.2f} | {ssim:.4f} | {angle:.3f} | {100 * place:.3f} | {seconds:.0f} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
