@@ -36,6 +36,16 @@ def disturbed(capture: dtv.Capture, degrees: float, shift: float, seed: int = 0)
     return dataclasses.replace(capture, cameras=cameras)
 
 
+def some_views(capture: dtv.Capture, training: int, tested: int) -> dtv.Capture:
+    """The capture with fewer views, evenly spread; 0 leaves all of a kind."""
+    chosen: list[int] = []
+    for indices, count in ((capture.train_indices.tolist(), training), (capture.test_indices.tolist(), tested)):
+        chosen += indices if not count else [indices[k * len(indices) // count] for k in range(count)]
+    images, alphas = (torch.stack([part[view] for view in chosen]) for part in (capture.images, capture.alphas))
+    cameras = [capture.cameras[view] for view in chosen]
+    return dataclasses.replace(capture, cameras=cameras, images=images, alphas=alphas, test=capture.test[chosen])
+
+
 def pose_errors(found: list[dtv.Camera], true: list[dtv.Camera], views: list[int]) -> tuple[float, float]:
     """Mean errors of directions in degrees and of positions in parts of the distance, after a similarity transform."""
     a, b = (torch.stack([cameras[v].position.double() for v in views]) for cameras in (found, true))
@@ -48,8 +58,9 @@ def pose_errors(found: list[dtv.Camera], true: list[dtv.Camera], views: list[int
     angles = []
     for v in views:
         turned = found[v].world_to_camera[:3, :3].double() @ rotation.T
-        cosine = ((turned @ true[v].world_to_camera[:3, :3].double().T).trace() - 1.0) / 2.0
-        angles.append(math.degrees(math.acos(min(1.0, float(cosine)))))
+        # By the chord: near 0 a cosine has lost half of its digits.
+        chord = (turned - true[v].world_to_camera[:3, :3].double()).norm() / math.sqrt(8.0)
+        angles.append(math.degrees(2.0 * math.asin(min(1.0, float(chord)))))
     distance = (b - middle_b).norm(dim=1).mean()
     return sum(angles) / len(angles), float((places - b).norm(dim=1).mean() / distance)
 
@@ -62,10 +73,13 @@ def main() -> None:
     parser.add_argument("--cells", type=int, default=40_000)
     parser.add_argument("--degrees", type=float, default=0.5)
     parser.add_argument("--shift", type=float, default=0.01)
-    parser.add_argument("--rates", nargs="+", type=float, default=[2e-3])
+    parser.add_argument("--views", type=int, default=0, help="training views to take, evenly spread; 0: all")
+    parser.add_argument("--tested", type=int, default=0, help="held-out views to take; 0: all")
+    parser.add_argument("--rates", nargs="+", type=float, default=[5e-3])
     parser.add_argument("--only-refined", action="store_true")
     options = parser.parse_args()
     capture = dtv.load_capture(options.capture, downscale=options.downscale)
+    capture = some_views(capture, options.views, options.tested)
     off = disturbed(capture, options.degrees, options.shift)
     plain = dtv.FitConfig(cells=options.cells, iterations=options.iterations, evaluate_every=0)
     refined = [

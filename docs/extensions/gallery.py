@@ -15,6 +15,8 @@ _ORDER = [
     "own_training_loop",
     "recover_pose",
     "tomography",
+    "best_viewpoint",
+    "fit_transfer",
 ]
 
 

@@ -170,7 +170,10 @@ class Trainer:
             return
         field, options = self.parameters.detached_field(), self.config.cameras
         background = self.config.evaluation_background()
-        align_held_out(self.cameras, options, self.mesh, field, self._truth, views, background, self.processes)
+        align_held_out(
+            *(self.cameras, options, self.mesh, field, self._truth, views, background),
+            *(self.processes, self.config.deterministic),
+        )
 
     def require_agreement(self) -> None:
         """Checks that all processes have come to the same state.

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
+from typing import Any
+
 from difftetvr.capture.capture import Capture
 from difftetvr.errors import CaptureError
 from difftetvr.fitting.records.evaluation import rendered_image, true_image, valid_share, where_valid
@@ -31,6 +34,9 @@ def write_report(folder: RunFolder, result: FitResult, capture: Capture) -> None
         CaptureError: A picture cannot be written.
         FitError: The curves or the metrics cannot be written.
     """
+    if result.refined is not None:
+        capture = dataclasses.replace(capture, cameras=result.refined.cameras())
+        write_json(folder.cameras, _cameras_of(capture))
     save(folder.model, result.mesh, result.field)
     save_curves(folder.curves, result.history)
     _write_pictures(folder, result, capture)
@@ -56,6 +62,17 @@ def _write_pictures(folder: RunFolder, result: FitResult, capture: Capture) -> N
             shown = where_valid(capture, view, image, truth)
             rows.append((f"truth, view {view}", truth, shown, valid_share(capture, view)))
     save_comparisons(folder.comparison, rows)
+
+
+def _cameras_of(capture: Capture) -> dict[str, Any]:
+    """All cameras as JSON values, each as `difftetvr.rendering.save_camera` writes it."""
+    cameras = []
+    for view, camera in enumerate(capture.cameras):
+        numbers = {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height")}
+        pose = camera.world_to_camera.double().cpu().tolist()
+        is_test = bool(capture.test[view])
+        cameras.append({"view": view, "test": is_test, "world_to_camera": pose, **numbers})
+    return {"format": "difftetvr-refined-cameras", "cameras": cameras}
 
 
 def _spread(views: list[int], count: int) -> list[int]:

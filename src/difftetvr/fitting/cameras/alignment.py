@@ -30,6 +30,7 @@ def align_held_out(
     views: Sequence[int],
     background: Color,
     processes: Processes,
+    deterministic: bool,
 ) -> None:
     """Moves the cameras of held-out views to where their images fit best.
 
@@ -42,8 +43,12 @@ def align_held_out(
         views: Indices of the views; each is aligned by one of the processes.
         background: Behind the volume.
         processes: Those that fit together.
+        deterministic: Whether gradients are the same in every run to the last bit.
     """
-    own = [_aligned(cameras, options, mesh, field, truth, view, background) for view in processes.share(views)]
+    own = [
+        _aligned(cameras, options, mesh, field, truth, view, background, deterministic)
+        for view in processes.share(views)
+    ]
     rows = processes.gathered(own, len(views), 6)
     with torch.no_grad():
         for view, row in zip(views, rows, strict=True):
@@ -58,6 +63,7 @@ def _aligned(
     truth: Truth,
     view: int,
     background: Color,
+    deterministic: bool,
 ) -> list[float]:
     """The motion of a view's world with the least error of those that were tried."""
     expected, lens = truth.image(view, background), cameras.lens.detach()
@@ -67,7 +73,8 @@ def _aligned(
     for step in range(options.align_steps + 1):
         variable = motion.clone().requires_grad_()
         camera = cameras.camera_with(view, variable, lens)
-        image = render(mesh, field, camera, background=torch.tensor(background)).color.to(expected.device)
+        behind = torch.tensor(background)
+        image = render(mesh, field, camera, behind, deterministic=deterministic).color.to(expected.device)
         loss = (truth.where_valid(view, image, expected) - expected).square().mean()
         if float(loss.detach()) < least:
             best, least = motion, float(loss.detach())

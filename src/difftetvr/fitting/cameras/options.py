@@ -15,7 +15,7 @@ class CameraRefinement(OptionGroup):
 
     prefix: ClassVar[str] = "cameras."
 
-    rate: float = 2e-3
+    rate: float = 5e-3
     """Length of the first steps of a pose: radians, and half sides of the capture's box."""
     final_rate: float = 2e-4
     """Length of the last steps; in between it falls log-linearly."""

@@ -57,7 +57,8 @@ class RefinedCameras:
         self._unit = 0.5 * float((bounds[1] - bounds[0]).max())
         self._training = capture.train_indices
         places = torch.stack([camera.position.detach().cpu().double() for camera in capture.cameras])
-        self._towards = (places - self._center)[self._training]
+        towards = (places - self._center)[self._training]
+        self._towards = towards - towards.mean(0)  # so that taking growth out leaves the mean where it is
         self.motion = torch.zeros(count, 6, dtype=torch.float64).requires_grad_(poses)
         self.lens = torch.zeros(3, dtype=torch.float64).requires_grad_(intrinsics)
         self._state = {
@@ -148,7 +149,7 @@ class RefinedCameras:
             return
         rows = rows - rows.mean(0)
         # By what the world has grown: cameras come nearer or farther off, all in the same proportion.
-        growth = (rows[:, 3:] * self._towards).sum() / self._towards.square().sum()
+        growth = (rows[:, 3:] * self._towards).sum() / self._towards.square().sum().clamp(min=1e-300)
         self.motion[self._training] = torch.cat((rows[:, :3], rows[:, 3:] - growth * self._towards), dim=1)
 
     def state(self) -> dict[str, torch.Tensor]:

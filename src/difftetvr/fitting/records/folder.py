@@ -62,6 +62,11 @@ class RunFolder:
         return self.path / "cut.png"
 
     @property
+    def cameras(self) -> Path:
+        """Cameras as they were found, where they were unknown."""
+        return self.path / "cameras.json"
+
+    @property
     def views(self) -> Path:
         """Folder of single pictures of held-out views."""
         return self.path / "views"
@@ -73,7 +78,16 @@ class RunFolder:
         In this order they are removed: cut short, that never leaves a state to resume from without the options that it
         belongs to.
         """
-        return (self.checkpoint, self.model, self.metrics, self.curves, self.comparison, self.cut, self.config)
+        return (
+            self.checkpoint,
+            self.model,
+            self.metrics,
+            self.curves,
+            self.comparison,
+            self.cut,
+            self.cameras,
+            self.config,
+        )
 
     def holds_run(self) -> bool:
         """Whether a run has written into the folder."""

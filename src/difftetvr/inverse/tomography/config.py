@@ -104,7 +104,7 @@ class TomographyConfig:
     """Iterations between glances at a few held-out views, for the curves only; 0: never."""
     checkpoint_seconds: float = 60.0
     """Seconds between checkpoints."""
-    motion: Motion = field(default_factory=Motion)
+    motion: Motion = field(default_factory=lambda: Motion(rate=0.8, final_rate=0.04))
     """How vertices move."""
     exchange: Exchange = field(default_factory=lambda: Exchange(start=_START))
     """Options of --refine exchange."""
