@@ -49,16 +49,16 @@ class Variational:
 
     Attributes:
         weight: Of the total variation, in the units of `TomographyConfig.total_variation`.
-        passes: Over all views, on the coarse levels and on the last one.
-        subsets: How many the views are divided into.
+        updates: On each of the coarse levels, and on the last one; as many more as fill a pass over all views.
+        together: Views of an update; with fewer than three, momentum swings instead of gaining speed.
         momentum: Greatest share of the last step that is repeated.
         settling: Of the passes, how many of the last take no momentum.
         inner: Steps for the proximal map of the total variation, in each update.
     """
 
-    weight: float = 0.025
-    passes: tuple[int, int] = (4, 3)
-    subsets: int = 15
+    weight: float = 0.00625
+    updates: tuple[int, int] = (60, 30)
+    together: int = 3
     momentum: float = 0.8
     settling: int = 1
     inner: int = 4
@@ -93,19 +93,20 @@ def sart(scan: VoxelScan, size: int, options: Sart, watch: Watch) -> torch.Tenso
 
 def variational(scan: VoxelScan, size: int, options: Variational, watch: Watch) -> torch.Tensor:
     """(N^3) densities >= 0 that minimise half the mean of weighted squares, plus their total variation."""
+    rays = len(scan.train) * scan.measured.shape[1]
 
     def level(volume: torch.Tensor, coarse: VoxelScan, projector: VoxelProjector) -> torch.Tensor:
-        groups = coarse.subsets(options.subsets)
-        rays = len(coarse.train) * projector.pixels
+        groups = coarse.subsets(max(1, len(coarse.train) // options.together))
         curvature = torch.zeros_like(volume)
         for group in groups:
             curvature += projector.transpose(coarse.weight[group] * projector.lengths(group), group)
         curvature.clamp_min_(_LEAST_SUM * float(curvature.max()))
-        # The objective is that of the meshes, a mean over rays in units of the noise, times rays / precision.
+        # The objective is that of the meshes, a mean over rays in units of the noise, times rays / precision. With the
+        # rays of the whole scan, coarse levels have the same proportion of likelihood and prior as the last one.
         variation = options.weight * rays / coarse.precision / projector.size**2 / coarse.mean_density(projector)
         proximal = VariationProximal(curvature, variation, projector.size)
         ahead, speed = volume, 1.0
-        passes = options.passes[projector.size == size]
+        passes = -(-options.updates[projector.size == size] // len(groups))
         for step in range(passes):
             for group in groups:
                 residual = projector.forward(ahead, group).sub_(coarse.measured[group]).mul_(coarse.weight[group])
