@@ -158,5 +158,10 @@ def _by_pose(task: RenderTask, gradients: Gradients, vertices: torch.Tensor) -> 
     order = MemoryOrder.of(task.mesh).vertices
     seen = task.backend.tensor(gradients.vertices, -1, 4)[: order.shape[0], :3]
     columns = vertices.index_select(0, order).unbind(1)
-    by_rotation = torch.stack([(seen * column[:, None]).sum(0) for column in columns], dim=1)
-    return torch.nn.functional.pad(torch.cat((by_rotation, seen.sum(0)[:, None]), 1), (0, 0, 0, 1))
+    by_rotation = torch.stack([_sum(seen * column[:, None]) for column in columns], dim=1)
+    return torch.nn.functional.pad(torch.cat((by_rotation, _sum(seen)[:, None]), 1), (0, 0, 0, 1))
+
+
+def _sum(rows: torch.Tensor) -> torch.Tensor:
+    """(3,) sum of (V, 3), which does not tell in which order the vertices lie: that is chosen while a process runs."""
+    return rows.sum(0) if rows.device.type == "mps" else rows.sum(0, dtype=torch.float64).to(rows.dtype)
