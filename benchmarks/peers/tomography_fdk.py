@@ -29,7 +29,7 @@ class Feldkamp:
         cutoff: Frequency at which Hann's window ends, in units of the greatest that the pixels tell.
     """
 
-    cutoff: float = 0.6
+    cutoff: float = 0.3
 
 
 def feldkamp(scan: VoxelScan, size: int, options: Feldkamp) -> torch.Tensor:

@@ -1,7 +1,7 @@
 """Voxels from the projections that meshes are fitted to: FDK, OS-SART, and least squares with total variation.
 
 python benchmarks/peers/tomography_voxels.py SCAN [--truth VOLUME] [--sizes 128 256] [--rows fdk sart tv blurred]
-    [--holdout-every N] [--bin N] [--tv 0.00625 ...] [--cutoffs 0.6 ...] [--csv FILE] [--keep FOLDER]
+    [--holdout-every N] [--bin N] [--tv 0.00625 ...] [--cutoffs 0.3 ...] [--csv FILE] [--keep FOLDER]
 
 SCAN is what `difftetvr fit` takes as projections. Where several weights of the total variation or several cut-off
 frequencies are given, each is a row; choose among them by the held-out projections, quickest with fewer pixels (--bin).
