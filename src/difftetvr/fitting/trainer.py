@@ -147,6 +147,8 @@ class Trainer:
         if is_read:
             self._unread.read_moves(self.history)
         self.iteration += 1
+        if self.iteration == self.config.steps:
+            self._keep_free()
 
     def glance(self) -> None:
         """Notes the mean PSNR over a few held-out views, for the curves; decides nothing."""
@@ -372,10 +374,12 @@ class Trainer:
             if self.positions:
                 self.positions.carry(change)
             self._mesh = change.mesh
-        # Also those that have moved there since.
-        self.parameters.keep_free(self._free_space.contains(self._sites()))
+        self._keep_free()
         if refinement.surplus is not None:
             self.parameters.add(refinement.surplus, self.capture.density_unit)
+
+    def _keep_free(self) -> None:
+        self.parameters.keep_free(self._free_space.contains(self._sites()))  # also of those that have moved there
 
     def _color_gradients(self) -> torch.Tensor:
         return self._gradients.by_colors(self.mesh, self._train_views, self.iteration)

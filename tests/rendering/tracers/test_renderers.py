@@ -222,7 +222,7 @@ def test_faces_beside_the_camera_are_not_sought_in_the_whole_image() -> None:
     camera = Camera.look_at((0.05, 0.03, 0.01), (0.5, 1.0, 0.2), (0.0, 0.0, 1.0), 1.2, 64, 64)
     backend = backend_for(mesh.vertices)
     records = torch.nn.functional.pad(camera.to_camera_space(mesh.vertices), (0, 1))
-    scene = CellScene(backend, backend.floats(records), backend.uints(mesh.tets), camera.kernel_rays(backend), 1)
+    scene = CellScene(backend, backend.floats(records), backend.uints(mesh.tets), 1, camera.kernel_rays(backend))
     cells = mesh.vertices[mesh.tets.long()]
     depth = camera.to_camera_space(cells.reshape(-1, 3)).reshape(-1, 4, 3)[..., 2]
     crossing = (depth.amin(1) < 0) & (depth.amax(1) > 0)

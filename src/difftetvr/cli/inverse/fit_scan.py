@@ -6,6 +6,7 @@ import dataclasses
 import json
 import shlex
 import warnings
+import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,6 +29,10 @@ if TYPE_CHECKING:
     from difftetvr.capture.projections.projection_capture import ProjectionCapture
     from difftetvr.inverse.tomography.loop import TomographyResult
     from difftetvr.inverse.tomography.reconstruction import Reconstruction
+
+
+_META = "meta_data.json"
+_SUFFIXES = (".h5", ".hdf5", ".nxs", ".pickle", ".pkl", ".p")
 
 
 @dataclass(frozen=True)
@@ -186,15 +191,10 @@ class FitScan:
 
 def fits_scan(args: Sequence[str]) -> bool:
     """Whether arguments of ``difftetvr fit`` name projections, or a run to go on with that is of some."""
-    from difftetvr.capture.projections.readers.table import is_projection_source  # no command but this one needs it
-
     options = {"-o", "--output", "--config", "--initial-mesh", "--transfer-function", "--truth", "--geometry"}
     words = [word for before, word in zip(["", *args], args) if not word.startswith("-") and before not in options]
-    try:
-        if any(is_projection_source(word) for word in words):
-            return True
-    except (DiffTetError, OSError):
-        return False
+    if any(_names_projections(Path(word)) for word in words):
+        return True
     output = _value_of(args, ("-o", "--output"))
     if "--resume" not in args or output is None:
         return False
@@ -202,6 +202,22 @@ def fits_scan(args: Sequence[str]) -> bool:
         return "tomography" in json.loads(RunFolder(Path(output)).config.read_bytes())
     except (OSError, ValueError, TypeError, RecursionError):
         return False
+
+
+def _names_projections(path: Path) -> bool:
+    """What `is_projection_source` says, without NumPy and PyTorch: help and mistakes are answered at once."""
+    suffix = path.suffix.lower()
+    try:
+        if path.is_dir():
+            return (path / _META).is_file()
+        if suffix == ".npy":
+            return path.with_suffix(".json").is_file()
+        if suffix == ".npz":
+            with zipfile.ZipFile(path) as archive:
+                return "geometry.npy" in archive.namelist()
+    except (OSError, ValueError, zipfile.BadZipFile):
+        return False
+    return suffix in _SUFFIXES or path.name == _META
 
 
 def _value_of(args: Sequence[str], names: Sequence[str]) -> str | None:

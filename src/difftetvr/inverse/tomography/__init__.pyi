@@ -1,3 +1,4 @@
+from . import alignment as alignment
 from . import config as config
 from . import densities as densities
 from . import judgement as judgement
@@ -9,9 +10,10 @@ from . import reconstruction as reconstruction
 from . import scoring as scoring
 from . import solver as solver
 from . import variation as variation
+from .alignment import Alignment as Alignment
 from .config import TomographyConfig as TomographyConfig
 from .loop import TomographyResult as TomographyResult
 from .loop import reconstruct as reconstruct
 from .scoring import ProjectionScore as ProjectionScore
 
-__all__ = ["ProjectionScore", "TomographyConfig", "TomographyResult", "reconstruct"]
+__all__ = ["Alignment", "ProjectionScore", "TomographyConfig", "TomographyResult", "reconstruct"]

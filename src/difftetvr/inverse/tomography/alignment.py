@@ -9,14 +9,11 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Literal
 
 import torch
 
+from difftetvr.inverse.tomography.config import Refined
 from difftetvr.rendering.cameras.detector import Detector
-
-Refined = Literal["none", "axis", "views"]
-"""What is corrected: nothing; the place and the tilt of the axis in all views alike; or each view's shift besides."""
 
 _BETAS = (0.9, 0.99)
 _TILT_PER_PIXEL = 2.0  # a step of the tilt moves the ends of a row by about as much as one of the shift moves all

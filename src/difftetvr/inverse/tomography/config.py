@@ -14,7 +14,6 @@ from difftetvr.errors import FitError
 from difftetvr.fitting.motion import Motion
 from difftetvr.fitting.options import LARGEST_COUNT, first_difference, options_from_json, require
 from difftetvr.fitting.refinement import Exchange, Grow, Strategy
-from difftetvr.inverse.tomography.alignment import Refined
 from difftetvr.mesh.limits import MAX_CELLS
 
 if TYPE_CHECKING:
@@ -22,6 +21,10 @@ if TYPE_CHECKING:
 
 Likelihood = Literal["gaussian", "poisson", "l1"]
 """How residuals of line integrals count, see `difftetvr.inverse.tomography.likelihoods`."""
+
+Refined = Literal["none", "axis", "views"]
+"""What of the geometry is corrected: nothing; the place and the tilt of the axis in all views alike; or each view's
+shift besides."""
 
 Refine = Literal["exchange", "grow", "none"]
 """Names of refinement strategies: each but the last is also that of a field of `TomographyConfig`, with its options."""

@@ -35,13 +35,13 @@ def opacity_entropy(alpha: torch.Tensor) -> torch.Tensor:
 def color_entropy(color: torch.Tensor, references: torch.Tensor) -> torch.Tensor:
     """Entropy of the areas that some colours cover in an image: 1 where all of them cover as much.
 
-    Each pixel belongs to black and to each of the K references by the shares softmax(-|c - r|) of the distances of
+    Each pixel belongs to black and to each of the K references by the shares ``softmax(-|c - r|)`` of the distances of
     its colour; their means over the pixels are the areas p, and H = -sum p ln p / ln (K + 1) (Weiss and Westermann
     2022, in their code).
 
     Args:
         color: (H, W, 3) colours over black.
-        references: (K, 3) colours, K >= 1; of a transfer function those of its peaks, see :func:`reference_colors`.
+        references: (K, 3) colours, K >= 1; of a transfer function those of its peaks, see :func:`difftetvr.inverse.reference_colors`.
 
     Returns:
         The entropy, a scalar in [0, 1]; differentiable.
@@ -54,7 +54,7 @@ def color_entropy(color: torch.Tensor, references: torch.Tensor) -> torch.Tensor
 
 
 def reference_colors(content: Field | ScalarField) -> torch.Tensor:
-    """Colours whose areas :func:`color_entropy` is to compare.
+    """Colours whose areas :func:`difftetvr.inverse.color_entropy` is to compare.
 
     Of scalars: the colours of the transfer function's knots that are more opaque than both of their neighbours. Of
     colours and densities: the means of six groups of vertices or cells, by k-means of colours weighted by density.

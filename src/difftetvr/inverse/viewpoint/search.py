@@ -158,7 +158,7 @@ def best_viewpoint(
         mesh: The mesh.
         field: What it holds, see :func:`difftetvr.render`.
         config: What is measured, and from where; default: the opacity's entropy from an orbit.
-        colors: (K, 3) colours whose areas are compared; default: :func:`reference_colors`.
+        colors: (K, 3) colours whose areas are compared; default: :func:`difftetvr.inverse.reference_colors`.
         on_progress: Called with the number of climbs that have ended, and of all.
 
     Returns:
@@ -197,7 +197,7 @@ def sample_viewpoints(
         field: What it holds.
         count: Number of views, >= 1.
         config: What is measured, and from where.
-        colors: As for :func:`best_viewpoint`.
+        colors: As for :func:`difftetvr.best_viewpoint`.
         on_progress: Called with the number of views rendered, and of all.
 
     Returns:

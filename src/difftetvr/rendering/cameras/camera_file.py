@@ -30,7 +30,7 @@ _SIZES = ("width", "height")
 
 
 def save_camera(path: str | Path, camera: Camera) -> None:
-    """Writes a camera as JSON that :func:`load_camera`, and ``difftetvr render --camera``, read back to the bit.
+    """Writes a camera as JSON that :func:`difftetvr.rendering.load_camera`, and ``difftetvr render --camera``, read back to the bit.
 
     Args:
         path: File to write.
@@ -49,7 +49,7 @@ def save_camera(path: str | Path, camera: Camera) -> None:
 
 
 def load_camera(path: str | Path) -> Camera:
-    """Reads a camera that :func:`save_camera` wrote.
+    """Reads a camera that :func:`difftetvr.rendering.save_camera` wrote.
 
     Args:
         path: The file.
