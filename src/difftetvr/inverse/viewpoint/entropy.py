@@ -41,7 +41,8 @@ def color_entropy(color: torch.Tensor, references: torch.Tensor) -> torch.Tensor
 
     Args:
         color: (H, W, 3) colours over black.
-        references: (K, 3) colours, K >= 1; of a transfer function those of its peaks, see :func:`difftetvr.inverse.reference_colors`.
+        references: (K, 3) colours, K >= 1; of a transfer function those of its peaks, see
+            :func:`difftetvr.inverse.reference_colors`.
 
     Returns:
         The entropy, a scalar in [0, 1]; differentiable.

@@ -30,7 +30,9 @@ _SIZES = ("width", "height")
 
 
 def save_camera(path: str | Path, camera: Camera) -> None:
-    """Writes a camera as JSON that :func:`difftetvr.rendering.load_camera`, and ``difftetvr render --camera``, read back to the bit.
+    """Writes a camera as JSON.
+
+    :func:`difftetvr.rendering.load_camera` and ``difftetvr render --camera`` read it back to the bit.
 
     Args:
         path: File to write.
