@@ -20,10 +20,10 @@ from .photos.photo_capture import PhotoCapture as PhotoCapture
 from .photos.photo_capture import is_photo_source as is_photo_source
 from .photos.photo_set import CaptureWarning as CaptureWarning
 from .projections.geometry import ProjectionGeometry as ProjectionGeometry
+from .projections.naming import is_projection_source as is_projection_source
 from .projections.noise import Noise as Noise
 from .projections.projection_capture import ProjectionCapture as ProjectionCapture
 from .projections.projector import project_volume as project_volume
-from .projections.readers.table import is_projection_source as is_projection_source
 from .volumes.volume import Volume as Volume
 from .volumes.volume import is_volume_file as is_volume_file
 from .volumes.volume_capture import TOOTH as TOOTH

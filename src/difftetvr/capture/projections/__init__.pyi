@@ -10,9 +10,9 @@ from . import raw_scan as raw_scan
 from . import readers as readers
 from . import scan_file as scan_file
 from .geometry import ProjectionGeometry as ProjectionGeometry
+from .naming import is_projection_source as is_projection_source
 from .noise import Noise as Noise
 from .projection_capture import ProjectionCapture as ProjectionCapture
 from .projector import project_volume as project_volume
-from .readers.table import is_projection_source as is_projection_source
 
 __all__ = ["Noise", "ProjectionCapture", "ProjectionGeometry", "is_projection_source", "project_volume"]

@@ -19,12 +19,12 @@ from difftetvr.capture.projections.descriptions.described import Parts
 from difftetvr.capture.projections.descriptions.entries import Entries, read_json
 from difftetvr.capture.projections.descriptions.tigre import scan_of
 from difftetvr.capture.projections.geometry import geometry_of
+from difftetvr.capture.projections.naming import META_FOLDER
 from difftetvr.capture.projections.noise import log_variance
 from difftetvr.capture.projections.raw_scan import RawScan, ScanOptions, require_room
 from difftetvr.errors import CaptureError, shown
 from difftetvr.trust import file_beside
 
-NAME = "meta_data.json"
 _SPLITS = ("proj_train", "proj_test")
 _REVERSED = ("sVoxel", "nVoxel", "dVoxel", "offOrigin", "offDetector")
 
@@ -36,7 +36,7 @@ def read_meta_folder(path: Path, options: ScanOptions) -> RawScan:
         CaptureError: A file is missing, damaged, a pickle, or of another size than the scanner tells.
     """
     options.refuse_others(path)
-    file = path / NAME if path.is_dir() else path
+    file = path / META_FOLDER if path.is_dir() else path
     meta = Entries(read_json(file, "scan"), f"'{file}'")
     scanner = meta.required("scanner")
     if not isinstance(scanner, Mapping):

@@ -10,11 +10,11 @@ import numpy as np
 from difftetvr.archive import read_arrays
 from difftetvr.capture.projections.descriptions.entries import parse_json
 from difftetvr.capture.projections.geometry import geometry_of, parse_parts
+from difftetvr.capture.projections.naming import GEOMETRY
 from difftetvr.capture.projections.raw_scan import RawScan, ScanOptions, as_capture_errors, require_room
 from difftetvr.errors import CaptureError
 from difftetvr.mesh.io.hdf5 import PlainFile
 
-GEOMETRY = "geometry"
 _ARRAYS = ("line_integrals", "intensities", "flat", "dark", "variance", "valid", "test")
 _VALUES = ("line_integrals", "intensities")
 
