@@ -5,15 +5,13 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal, get_args
-
-import numpy as np
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
 
 from difftetvr.declared import require_declared
 from difftetvr.errors import FitError
 from difftetvr.fitting.cameras.options import CameraRefinement
 from difftetvr.fitting.motion import Motion
-from difftetvr.fitting.options import LARGEST_COUNT, first_difference, options_from_json, require
+from difftetvr.fitting.options import LARGEST_COUNT, Schedule, options_from_json, require
 from difftetvr.fitting.refinement import Exchange, Grow, Star, Strategy
 from difftetvr.mesh.limits import CELLS_PER_CUBE, MAX_CELLS, MAX_DEGREE
 
@@ -28,8 +26,6 @@ Refine = Literal["exchange", "grow", "star", "none"]
 
 Background = Literal["black", "white", "random"] | tuple[float, float, float]
 
-# Independent streams of random numbers.
-_VIEW_STREAM, _BACKGROUND_STREAM, _REFINEMENT_STREAM = range(3)
 BACKGROUND_COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 """R G B of the backgrounds that have names."""
 
@@ -64,12 +60,9 @@ _CHOICES_FOR_VOLUMES: dict[str, Any] = {
 CHOSEN_FOR_CAPTURE = tuple(_CHOICES_FOR_VOLUMES)
 """Options whose default depends on the images."""
 
-# What a resumed run may choose anew: what changes nothing about where the optimisation goes, and how far it goes.
-_FREE_OPTIONS = frozenset({"device", "evaluate_every", "checkpoint_seconds", "iterations"})
-
 
 @dataclass(frozen=True)
-class FitConfig:
+class FitConfig(Schedule):
     """How colours, densities and vertex positions are optimised while the mesh refines itself.
 
     The defaults reconstruct the Tooth benchmark. Rates are steps of Adam per iteration in units of the quantity:
@@ -77,6 +70,8 @@ class FitConfig:
     No function keeps them in range: after each step they are projected, colours to [0, 1] and densities to [0, inf).
     Unlike the image of an exponential or a softplus, that range includes 0, so empty space becomes exactly empty.
     """
+
+    free: ClassVar[frozenset[str]] = frozenset({"device", "evaluate_every", "checkpoint_seconds", "iterations"})
 
     cells: int | None = None
     """Budget of tetrahedra: the run begins with about as many, and refinement ends within it. Default: 20 000; for
@@ -264,46 +259,14 @@ class FitConfig:
 
     def motion_rate_at(self, iteration: int) -> float | None:
         """Length of the vertices' steps, in altitudes; None where they stay."""
-        progress = iteration / (self.motion.until * self.steps)
-        return (self.pace or 1.0) * self.motion.rate_at(progress) if self.move and progress < 1.0 else None
-
-    def refinement_views_at(self, iteration: int, count: int, view_count: int) -> list[int]:
-        """Positions, in [0, view_count), of the random training views that a refinement is judged on.
-
-        Args:
-            iteration: Iterations done.
-            count: How many; all views where there are fewer.
-            view_count: Number of training views.
-        """
-        return [int(k) for k in self.refinement_random(iteration).permutation(view_count)[:count]]
-
-    def refinement_random(self, iteration: int) -> np.random.Generator:
-        """Chance for what a refinement is judged on.
-
-        Args:
-            iteration: Iterations done.
-        """
-        return np.random.default_rng([self.seed, _REFINEMENT_STREAM, iteration])
-
-    def rate_at(self, iteration: int) -> float:
-        """Learning rate of a step, log-linear from ``rate`` (iteration 0) to ``final_rate`` (the last one)."""
-        fraction = iteration / max(self.steps - 1, 1)
-        return self.rate * (self.final_rate / self.rate) ** fraction
-
-    def views_at(self, iteration: int, view_count: int) -> list[int]:
-        """Positions, in [0, view_count), of the training views of a step.
-
-        The views are shuffled anew in each pass over them. The order is a function of seed and iteration alone, so a
-        resumed run sees the views that an uninterrupted one would have seen.
-        """
-        first = iteration * self.batch
-        return [self._view(k, view_count) for k in range(first, first + self.batch)]
+        rate = super().motion_rate_at(iteration)
+        return None if rate is None else (self.pace or 1.0) * rate
 
     def background_at(self, iteration: int) -> tuple[float, float, float]:
         """Linear RGB background of a step; like the views a function of seed and iteration alone."""
         if self.background != "random":
             return self.evaluation_background()
-        r, g, b = np.random.default_rng([self.seed, _BACKGROUND_STREAM, iteration]).random(3)
+        r, g, b = self.step_random(iteration).random(3)
         return float(r), float(g), float(b)
 
     def evaluation_background(self) -> tuple[float, float, float]:
@@ -311,24 +274,6 @@ class FitConfig:
         if self.background is None or isinstance(self.background, str):
             return BACKGROUND_COLORS["black" if self.background in (None, "black") else "white"]
         return self.background
-
-    def require_same_run(self, other: FitConfig) -> None:
-        """Checks that ``other`` would take the same steps as these options of a saved run, were it of the same length.
-
-        Raises:
-            FitError: An option that decides the steps differs; names the first one.
-        """
-        differing = first_difference(self, other, _FREE_OPTIONS)
-        if differing is not None:
-            name, mine, theirs = differing
-            raise FitError(
-                f"The saved run has {name} = {mine}, this run asks for {theirs}; resume with the same options or start "
-                "anew."
-            )
-
-    def to_json(self) -> dict[str, Any]:
-        """The options as JSON values."""
-        return dataclasses.asdict(self)
 
     @staticmethod
     def from_json(values: object) -> FitConfig:
@@ -338,10 +283,6 @@ class FitConfig:
             FitError: An option is unknown, of the wrong type or out of range.
         """
         return options_from_json(FitConfig, values)
-
-    def _view(self, position: int, view_count: int) -> int:
-        epoch, offset = divmod(position, view_count)
-        return int(np.random.default_rng([self.seed, _VIEW_STREAM, epoch]).permutation(view_count)[offset])
 
 
 def _positive(value: float) -> bool:

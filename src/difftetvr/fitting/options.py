@@ -11,6 +11,8 @@ import difflib
 import reprlib
 from typing import Any, ClassVar, TypeVar
 
+import numpy as np
+
 from difftetvr.declared import as_declared, declared_types, in_words, require_declared
 from difftetvr.errors import FitError, shown
 
@@ -18,6 +20,9 @@ LARGEST_COUNT = 2**31 - 1
 """Greatest value of options that count something."""
 
 _Options = TypeVar("_Options")
+
+# Independent streams of random numbers: order of views, what a step does with them, what refinements are judged on.
+_VIEW_STREAM, _STEP_STREAM, _REFINEMENT_STREAM = range(3)
 
 
 def require(condition: bool, name: str, value: object, rule: str) -> None:
@@ -47,6 +52,100 @@ class OptionGroup:
 
     def _require(self, condition: bool, name: str, rule: str) -> None:
         require(condition, f"{self.prefix}{name}", getattr(self, name), rule)
+
+
+class Schedule:
+    """Base of options of a run that optimises something and moves a mesh: which views and rates a step has.
+
+    All of it is a function of the options and the iteration alone, so a resumed run sees what an uninterrupted one
+    would have seen. Subclasses are dataclasses with the fields that are named here.
+
+    Attributes:
+        free: Options that a resumed run may choose anew: what changes nothing about where the optimisation goes, and
+            how far it goes.
+    """
+
+    free: ClassVar[frozenset[str]]
+    seed: int
+    rate: float
+    final_rate: float
+    move: bool
+    motion: Any
+
+    @property
+    def steps(self) -> int:
+        """Number of optimisation steps."""
+        raise NotImplementedError
+
+    @property
+    def batch(self) -> int:
+        """Training views per step."""
+        raise NotImplementedError
+
+    def rate_at(self, iteration: int) -> float:
+        """Learning rate of a step, log-linear from ``rate`` (iteration 0) to ``final_rate`` (the last one)."""
+        fraction = iteration / max(self.steps - 1, 1)
+        return self.rate * (self.final_rate / self.rate) ** fraction
+
+    def motion_rate_at(self, iteration: int) -> float | None:
+        """Length of the vertices' steps, in altitudes; None where they stay."""
+        progress = iteration / (self.motion.until * self.steps)
+        return float(self.motion.rate_at(progress)) if self.move and progress < 1.0 else None
+
+    def views_at(self, iteration: int, view_count: int) -> list[int]:
+        """Positions, in [0, view_count), of the training views of a step.
+
+        The views are shuffled anew in each pass over them.
+        """
+        first = iteration * self.batch
+        return [self._view(k, view_count) for k in range(first, first + self.batch)]
+
+    def refinement_random(self, iteration: int) -> np.random.Generator:
+        """Chance for what a refinement is judged on.
+
+        Args:
+            iteration: Iterations done.
+        """
+        return self._random(_REFINEMENT_STREAM, iteration)
+
+    def refinement_views_at(self, iteration: int, count: int, view_count: int) -> list[int]:
+        """Positions, in [0, view_count), of the random training views that a refinement is judged on.
+
+        Args:
+            iteration: Iterations done.
+            count: How many; all views where there are fewer.
+            view_count: Number of training views.
+        """
+        return [int(k) for k in self.refinement_random(iteration).permutation(view_count)[:count]]
+
+    def step_random(self, iteration: int) -> np.random.Generator:
+        """Chance for what a step does with its views."""
+        return self._random(_STEP_STREAM, iteration)
+
+    def require_same_run(self, other: Schedule) -> None:
+        """Checks that ``other`` would take the same steps as these options of a saved run, were it of the same length.
+
+        Raises:
+            FitError: An option that decides the steps differs; names the first one.
+        """
+        differing = _first_difference(self, other, self.free)
+        if differing is not None:
+            name, mine, theirs = differing
+            raise FitError(
+                f"The saved run has {name} = {mine}, this run asks for {theirs}; resume with the same options or start "
+                "anew."
+            )
+
+    def to_json(self) -> dict[str, Any]:
+        """The options as JSON values."""
+        return dataclasses.asdict(self)  # type: ignore[call-overload]
+
+    def _view(self, position: int, view_count: int) -> int:
+        epoch, offset = divmod(position, view_count)
+        return int(self._random(_VIEW_STREAM, epoch).permutation(view_count)[offset])
+
+    def _random(self, stream: int, number: int) -> np.random.Generator:
+        return np.random.default_rng([self.seed, stream, number])
 
 
 def options_from_json(kind: type[_Options], values: object, path: str = "") -> _Options:
@@ -89,7 +188,7 @@ def options_from_json(kind: type[_Options], values: object, path: str = "") -> _
     return kind(**options)
 
 
-def first_difference(
+def _first_difference(
     first: Any, second: Any, free: frozenset[str], prefix: str = ""
 ) -> tuple[str, object, object] | None:
     """Name and both values of the first option in which two runs differ; None if there is none.
@@ -103,7 +202,7 @@ def first_difference(
         name, mine, theirs = f"{prefix}{item.name}", getattr(first, item.name), getattr(second, item.name)
         if name in free or mine == theirs:
             continue
-        within = first_difference(mine, theirs, free, f"{name}.") if dataclasses.is_dataclass(mine) else None
+        within = _first_difference(mine, theirs, free, f"{name}.") if dataclasses.is_dataclass(mine) else None
         return within or (name, mine, theirs)
     return None
 

@@ -5,14 +5,12 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal, get_args
-
-import numpy as np
+from typing import TYPE_CHECKING, ClassVar, Literal, get_args
 
 from difftetvr.declared import require_declared
 from difftetvr.errors import FitError
 from difftetvr.fitting.motion import Motion
-from difftetvr.fitting.options import LARGEST_COUNT, first_difference, options_from_json, require
+from difftetvr.fitting.options import LARGEST_COUNT, Schedule, options_from_json, require
 from difftetvr.fitting.refinement import Exchange, Grow, Strategy
 from difftetvr.mesh.limits import MAX_CELLS
 
@@ -28,9 +26,6 @@ shift besides."""
 
 Refine = Literal["exchange", "grow", "none"]
 """Names of refinement strategies: each but the last is also that of a field of `TomographyConfig`, with its options."""
-
-# Independent streams of random numbers.
-_VIEW_STREAM, _PHASE_STREAM, _REFINEMENT_STREAM = range(3)
 
 _START = 0.1
 """Part of their best surplus that new vertices start with: a ray passes many of them, and each one's best step would
@@ -50,17 +45,19 @@ _RANGES = {
     "evaluate_every": (0, LARGEST_COUNT),
     "seed": (0, LARGEST_COUNT),
 }
-# What a resumed run may choose anew: what changes nothing about where the optimisation goes, and how far it goes.
-_FREE_OPTIONS = frozenset({"device", "evaluate_every", "checkpoint_seconds", "iterations", "solve_steps", "solve_rays"})
 
 
 @dataclass(frozen=True)
-class TomographyConfig:
+class TomographyConfig(Schedule):
     """How densities and vertex positions are optimised from line integrals while the mesh refines itself.
 
     Rates are steps of Adam per iteration in units of the mean density that the scan shows. Steps of vertices are
     counted in altitudes of their cells.
     """
+
+    free: ClassVar[frozenset[str]] = frozenset(
+        {"device", "evaluate_every", "checkpoint_seconds", "iterations", "solve_steps", "solve_rays"}
+    )
 
     cells: int | None = None
     """Budget of tetrahedra: the run begins with about as many, and refinement ends within it. Default: one for every 40
@@ -146,6 +143,11 @@ class TomographyConfig:
         """Number of optimisation steps."""
         return self.iterations
 
+    @property
+    def batch(self) -> int:
+        """Training views per step."""
+        return self.batch_views
+
     def strategy(self) -> Strategy | None:
         """How the mesh is refined, in rounds between which densities can settle; None if it is not."""
         if self.refine == "none":
@@ -153,50 +155,6 @@ class TomographyConfig:
         chosen: Exchange = getattr(self, self.refine)
         rounds = chosen.rounds or max(1, min(_ROUNDS, self.steps // _ITERATIONS_PER_ROUND))
         return dataclasses.replace(chosen, rounds=rounds)
-
-    def rate_at(self, iteration: int) -> float:
-        """Learning rate of a step, log-linear from ``rate`` (iteration 0) to ``final_rate`` (the last one)."""
-        fraction = iteration / max(self.steps - 1, 1)
-        return self.rate * (self.final_rate / self.rate) ** fraction
-
-    def motion_rate_at(self, iteration: int) -> float | None:
-        """Length of the vertices' steps, in altitudes; None where they stay."""
-        progress = iteration / (self.motion.until * self.steps)
-        return self.motion.rate_at(progress) if self.move and progress < 1.0 else None
-
-    def views_at(self, iteration: int, view_count: int) -> list[int]:
-        """Positions, in [0, view_count), of the training views of a step.
-
-        The views are shuffled anew in each pass over them, as a function of seed and iteration alone.
-        """
-        first = iteration * self.batch_views
-        return [self._view(k, view_count) for k in range(first, first + self.batch_views)]
-
-    def phases_at(self, iteration: int) -> np.random.Generator:
-        """Chance for which pixels a step begins with."""
-        return np.random.default_rng([self.seed, _PHASE_STREAM, iteration])
-
-    def refinement_random(self, iteration: int) -> np.random.Generator:
-        """Chance for what a refinement is judged on."""
-        return np.random.default_rng([self.seed, _REFINEMENT_STREAM, iteration])
-
-    def require_same_run(self, other: TomographyConfig) -> None:
-        """Checks that ``other`` would take the same steps as these options of a saved run, were it of the same length.
-
-        Raises:
-            FitError: An option that decides the steps differs; names the first one.
-        """
-        differing = first_difference(self, other, _FREE_OPTIONS)
-        if differing is not None:
-            name, mine, theirs = differing
-            raise FitError(
-                f"The saved run has {name} = {mine}, this run asks for {theirs}; resume with the same options or start "
-                "anew."
-            )
-
-    def to_json(self) -> dict[str, Any]:
-        """The options as JSON values."""
-        return dataclasses.asdict(self)
 
     @staticmethod
     def from_json(values: object) -> TomographyConfig:
@@ -206,7 +164,3 @@ class TomographyConfig:
             FitError: An option is unknown, of the wrong type or out of range.
         """
         return options_from_json(TomographyConfig, values)
-
-    def _view(self, position: int, view_count: int) -> int:
-        epoch, offset = divmod(position, view_count)
-        return int(np.random.default_rng([self.seed, _VIEW_STREAM, epoch]).permutation(view_count)[offset])
