@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import torch
@@ -22,21 +21,20 @@ from difftetvr.fitting.positions import VertexOptimizer
 from difftetvr.fitting.processes import ALONE, Processes
 from difftetvr.fitting.records.checkpoint import Checkpoint, describe_capture, require_same_capture
 from difftetvr.fitting.records.evaluation import Evaluation, compared
-from difftetvr.fitting.records.history import History, RefinementRecord
-from difftetvr.fitting.records.result import Progress
+from difftetvr.fitting.records.history import History
 from difftetvr.fitting.records.unread import Unread
-from difftetvr.fitting.refinement import Moment, Refinement, Situation, Strategy
+from difftetvr.fitting.refinement import Refinement, Situation, Strategy
+from difftetvr.fitting.refinement.adaptive_run import AdaptiveRun
 from difftetvr.fitting.refinement.pixels import Judgement
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.rendering.gauss_newton import ImageModel
 
-_GLANCE_VIEWS = 4
 _READ_EVERY = 25
 """Iterations from one question to a GPU how they went to the next: the host waits for each answer."""
-_POSITIONS, _CAMERAS = "positions.", "cameras."  # prefixes of their states in a checkpoint
+_CAMERAS = "cameras."  # prefix of their state in a checkpoint
 
 
-class Trainer:
+class Trainer(AdaptiveRun):
     """A reconstruction between two iterations; its state alone decides how it goes on.
 
     Attributes:
@@ -97,18 +95,12 @@ class Trainer:
         self.iteration = 0
         self.history = History()
         self._unread = Unread()
-        self._train_views: list[int] = capture.train_indices.tolist()
+        self._train_views, self._test_views = capture.train_indices.tolist(), capture.test_indices.tolist()
         self._truth = Truth(capture, self._mesh.vertices.device).keep(self._train_views + self._glanced_views())
         self.cameras = _cameras(capture, config)
         self._truth.cameras = None if self.cameras is None else self.cameras.known
         self._gradients = ViewGradients(self._truth, config, self.parameters, processes, self.cameras)
         self._capture_description = describe_capture(capture)
-
-    @property
-    def mesh(self) -> TetMesh:
-        """The mesh as it is now, detached."""
-        mesh = self.positions.mesh if self.positions else self._mesh
-        return mesh.with_vertices(mesh.vertices.detach())
 
     def step(self) -> None:
         """One iteration: refines the mesh where that is due, renders views, moves parameters and vertices.
@@ -134,7 +126,7 @@ class Trainer:
     def _iterate(self) -> None:
         self._refine_if_due()
         rate = self._motion_rate()
-        mesh = self.positions.mesh if self.positions and rate is not None else self.mesh
+        mesh = self._moving_mesh(rate)
         batch = [self._train_views[k] for k in self.config.views_at(self.iteration, len(self._train_views))]
         self._unread.add(self.iteration, *self._gradients.gather(mesh, batch, self.iteration))
         is_read = self._is_read()
@@ -197,10 +189,7 @@ class Trainer:
             FitError: A loss on the way to it is not finite.
         """
         self.catch_up()
-        tensors = {"vertices": self.mesh.vertices, "tets": self.mesh.tets, **self.parameters.state()}
-        if self.positions:
-            state = self.positions.state()
-            tensors |= {_POSITIONS + name: tensor for name, tensor in state.items() if name not in tensors}
+        tensors = self._mesh_state() | self.parameters.state()
         if self.cameras is not None:
             tensors |= {_CAMERAS + name: tensor for name, tensor in self.cameras.state().items()}
         strategy = type(self.strategy).__name__
@@ -241,8 +230,7 @@ class Trainer:
         checkpoint.require_strategy(type(trainer.strategy).__name__)
         checkpoint.require_tensors_like(trainer.checkpoint().tensors)
         trainer.parameters.restore(checkpoint.tensors)
-        if trainer.positions:
-            trainer.positions.restore({k.removeprefix(_POSITIONS): v for k, v in checkpoint.tensors.items()})
+        trainer._restore_positions(checkpoint.tensors)
         if trainer.cameras is not None:
             trainer.cameras.restore({k.removeprefix(_CAMERAS): v for k, v in checkpoint.tensors.items()})
         trainer.budget = checkpoint.budget
@@ -250,33 +238,6 @@ class Trainer:
         trainer.history = checkpoint.history
         trainer.repair = checkpoint.repair
         return trainer
-
-    def progress(self, seconds: float) -> Progress:
-        """A summary for a display; loss and PSNR are means over the last pass through the training views."""
-        window = self._epoch
-        losses, psnrs = self.history.loss[-window:], self.history.psnr[-window:]
-        return Progress(
-            iteration=self.iteration,
-            iterations=self.config.steps,
-            loss=sum(losses) / max(1, len(losses)),
-            train_psnr=sum(psnrs) / max(1, len(psnrs)),
-            held_out_psnr=self.history.evaluations[-1][1] if self.history.evaluations else None,
-            cells=self.mesh.num_cells,
-            moves=self.history.moves,
-            refinements=len(self.history.refinements),
-            last_refinement=self.history.refinements[-1] if self.history.refinements else None,
-            seconds=seconds,
-        )
-
-    @property
-    def _epoch(self) -> int:
-        """Iterations of one pass over the training views."""
-        return max(1, len(self._train_views) // self.config.batch)
-
-    def _glanced_views(self) -> list[int]:
-        """A few held-out views, evenly spread."""
-        tested: list[int] = self.capture.test_indices.tolist()
-        return tested[:: max(1, math.ceil(len(tested) / _GLANCE_VIEWS))]
 
     def _budget(self, mesh_is_given: bool) -> int:
         """The options' cells; a given mesh is its own budget, unless the strategy is to make it grow."""
@@ -290,22 +251,6 @@ class Trainer:
         """(N, 3) positions of the vertices, or centres of the cells, that the parameters belong to."""
         mesh = self.mesh
         return mesh.vertices if self.config.location == "vertex" else mesh.vertices[mesh.tets.long()].mean(1)
-
-    def _moment(self) -> Moment:
-        return Moment(self.iteration, self.config.steps, self._epoch, self.mesh.num_cells, self.budget)
-
-    def _motion_rate(self) -> float | None:
-        """Rate of the vertices' steps, None where they stay."""
-        held = self.strategy is not None and not self.strategy.lets_move(self._moment())
-        return None if held else self.config.motion_rate_at(self.iteration)
-
-    def _move(self, rate: float | None) -> None:
-        if self.positions is None:
-            return
-        if rate is None:
-            self.positions.zero_grad()
-        elif (self.iteration + 1) % self.config.motion.every == 0:
-            self._unread.add_moves(self.positions.advance(rate))
 
     def _is_read(self) -> bool:
         """Whether the history learns now how this iteration went."""
@@ -338,20 +283,7 @@ class Trainer:
         judges = judgement.some()
         before = judges.error(mesh, self.parameters.detached_field())
         self._apply(refinement)
-        self.history.refinements.append(
-            RefinementRecord(
-                iteration=self.iteration,
-                cells_before=mesh.num_cells,
-                cells=self.mesh.num_cells,
-                vertices=self.mesh.num_vertices,
-                removed=refinement.removed,
-                added=refinement.added,
-                flipped=refinement.flipped,
-                predicted=refinement.predicted,
-                error_before=before,
-                error_after=judges.error(self.mesh, self.parameters.detached_field()),
-            )
-        )
+        self._record(refinement, mesh, (before, judges.error(self.mesh, self.parameters.detached_field())))
 
     def _judgement(self, views: int) -> Judgement:
         """What a refinement is judged on."""
@@ -371,9 +303,7 @@ class Trainer:
     def _apply(self, refinement: Refinement) -> None:
         for change in refinement.changes:
             self.parameters.carry(change)
-            if self.positions:
-                self.positions.carry(change)
-            self._mesh = change.mesh
+            self._adopt(change)
         self._keep_free()
         if refinement.surplus is not None:
             self.parameters.add(refinement.surplus, self.capture.density_unit)

@@ -7,6 +7,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from difftetvr.fitting.options import options_from_json
+from difftetvr.mesh.tetmesh import TetMesh
+
+_TRAIN_WINDOW = 64
 
 
 @dataclass(frozen=True)
@@ -74,6 +77,19 @@ class History:
     refinements: list[RefinementRecord] = field(default_factory=list)
     moves: MoveTotals = field(default_factory=MoveTotals)
     seconds: float = 0.0
+
+    def metrics(self, mesh: TetMesh) -> dict[str, Any]:
+        """The numbers of a finished run with its mesh, as JSON values; see `FitResult.metrics`."""
+        last = self.psnr[-_TRAIN_WINDOW:]
+        return {
+            "train_psnr": sum(last) / len(last) if last else None,
+            "cells": mesh.num_cells,
+            "vertices": mesh.num_vertices,
+            "iterations": len(self.loss),
+            "moves": dataclasses.asdict(self.moves),
+            "refinements": [{**dataclasses.asdict(r), "achieved": r.achieved} for r in self.refinements],
+            "seconds": self.seconds,
+        }
 
     def events(self) -> dict[str, Any]:
         """All but the series of every iteration, as JSON values."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 from difftetvr.fitting.cameras.refined import RefinedCameras
@@ -11,8 +11,6 @@ from difftetvr.fitting.records.evaluation import Evaluation
 from difftetvr.fitting.records.history import History, MoveTotals, RefinementRecord
 from difftetvr.mesh.field import Field
 from difftetvr.mesh.tetmesh import TetMesh
-
-_TRAIN_WINDOW = 64
 
 
 @dataclass(frozen=True)
@@ -72,15 +70,8 @@ class FitResult:
         ``ssim_per_view`` belong to ``views``, ``train_psnr`` is the mean over the views of the last 64
         iterations, ``seconds`` the time of the optimisation. ``moves`` and ``refinements`` are those of the history.
         """
-        last = self.history.psnr[-_TRAIN_WINDOW:]
         return {
             **self.evaluation.to_json(),
-            "train_psnr": sum(last) / len(last) if last else None,
-            "cells": self.mesh.num_cells,
-            "vertices": self.mesh.num_vertices,
-            "iterations": len(self.history.loss),
-            "moves": asdict(self.history.moves),
-            "refinements": [{**asdict(r), "achieved": r.achieved} for r in self.history.refinements],
-            "seconds": self.history.seconds,
+            **self.history.metrics(self.mesh),
             **({} if self.refined is None else {"cameras": self.refined.summary()}),
         }

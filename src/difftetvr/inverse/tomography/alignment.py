@@ -12,6 +12,7 @@ import math
 
 import torch
 
+from difftetvr.fitting.parameters import CarriedAdam
 from difftetvr.inverse.tomography.config import Refined
 from difftetvr.rendering.cameras.detector import Detector
 
@@ -46,13 +47,7 @@ class Alignment:
         for leaf in self._leaves:
             leaf.requires_grad_()
         self._rates = [1.0, _TILT_PER_PIXEL / width, 1.0][:count]
-        self._optimizer = None
-        if self._leaves:
-            groups = [{"params": [leaf]} for leaf in self._leaves]
-            self._optimizer = torch.optim.Adam(groups, betas=_BETAS)
-            for leaf in self._leaves:
-                zeros = torch.zeros_like(leaf, requires_grad=False)
-                self._optimizer.state[leaf] = {"step": torch.zeros(()), "exp_avg": zeros, "exp_avg_sq": zeros.clone()}
+        self._optimizer = CarriedAdam([[leaf] for leaf in self._leaves], 0.0, _BETAS) if self._leaves else None
 
     @property
     def is_learned(self) -> bool:
@@ -89,7 +84,7 @@ class Alignment:
     def zero_grad(self) -> None:
         """Forgets the gradients."""
         if self._optimizer is not None:
-            self._optimizer.zero_grad(set_to_none=True)
+            self._optimizer.zero_grad()
 
     def step(self, rate: float) -> None:
         """One step with the accumulated gradients.
@@ -101,9 +96,7 @@ class Alignment:
             return
         if self.shift.grad is not None:
             self.shift.grad[1] = 0.0
-        for group, share in zip(self._optimizer.param_groups, self._rates, strict=True):
-            group["lr"] = share * rate
-        self._optimizer.step()
+        self._optimizer.step([share * rate for share in self._rates])
 
     def state(self) -> dict[str, torch.Tensor]:
         """Corrections and optimiser state by name."""
@@ -113,7 +106,7 @@ class Alignment:
         tensors = {}
         for name, leaf in zip(names, self._leaves, strict=False):
             tensors[f"alignment.{name}"] = leaf
-            for key, value in self._optimizer.state[leaf].items():
+            for key, value in self._optimizer.state(leaf).items():
                 tensors[f"alignment.{name}.{key}"] = value
         return tensors
 

@@ -53,8 +53,9 @@ class Judgement:
         faces = mesh.topology.faces.shape[0]
         steps = density.new_zeros(faces) if face_steps is None else unit * face_steps[:, 3].to(density)
         total: ImageModel | None = None
+        share = 1.0 / self._count
         for part in self.parts:
-            residuals, share = self._residuals(mesh, density, part), 1.0 / self._count
+            residuals = self._residuals(mesh, density, part)
             errors = share * residuals.slope, share * residuals.curvature
             model = model_line_integrals(mesh, density, part.camera, errors, steps, self.deterministic)
             total = model if total is None else total + model

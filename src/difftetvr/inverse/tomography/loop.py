@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from types import NoneType
 from typing import Any
@@ -23,8 +23,6 @@ from difftetvr.inverse.tomography.reconstruction import Reconstruction
 from difftetvr.inverse.tomography.scoring import ProjectionScore
 from difftetvr.mesh.field import Field
 from difftetvr.mesh.tetmesh import TetMesh
-
-_TRAIN_WINDOW = 64
 
 
 @dataclass(frozen=True)
@@ -50,17 +48,10 @@ class TomographyResult:
     @property
     def metrics(self) -> dict[str, Any]:
         """The numbers of the run, as JSON values."""
-        last = self.history.psnr[-_TRAIN_WINDOW:]
         return {
             **self.score.to_json(),
             **self.alignment.to_json(),
-            "train_psnr": sum(last) / len(last) if last else None,
-            "cells": self.mesh.num_cells,
-            "vertices": self.mesh.num_vertices,
-            "iterations": len(self.history.loss),
-            "moves": asdict(self.history.moves),
-            "refinements": [{**asdict(r), "achieved": r.achieved} for r in self.history.refinements],
-            "seconds": self.history.seconds,
+            **self.history.metrics(self.mesh),
         }
 
 

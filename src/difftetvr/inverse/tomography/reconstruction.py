@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -15,10 +14,10 @@ from difftetvr.fitting.beginning.requirements import resolve_device
 from difftetvr.fitting.positions import VertexOptimizer
 from difftetvr.fitting.processes import ALONE
 from difftetvr.fitting.records.checkpoint import Checkpoint
-from difftetvr.fitting.records.history import History, RefinementRecord
-from difftetvr.fitting.records.result import Progress
+from difftetvr.fitting.records.history import History
 from difftetvr.fitting.records.unread import Unread
-from difftetvr.fitting.refinement import Moment, Refinement, Situation, Strategy
+from difftetvr.fitting.refinement import Refinement, Situation, Strategy
+from difftetvr.fitting.refinement.adaptive_run import AdaptiveRun
 from difftetvr.inverse.tomography.alignment import Alignment
 from difftetvr.inverse.tomography.config import TomographyConfig
 from difftetvr.inverse.tomography.densities import Densities
@@ -33,13 +32,12 @@ from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.rendering import render
 from difftetvr.rendering.gauss_newton import ImageModel
 
-_GLANCE_VIEWS, _GLANCED_RAYS = 4, 16_384
+_GLANCED_RAYS = 16_384
 _PENALTY_EVERY = 4
 """Iterations that share one evaluation of the penalty, which costs as much as some ten thousand rays."""
-_POSITIONS = "positions."  # prefix of the positions' state in a checkpoint
 
 
-class Reconstruction:
+class Reconstruction(AdaptiveRun):
     """A reconstruction between two iterations; its state alone decides how it goes on.
 
     Attributes:
@@ -68,6 +66,7 @@ class Reconstruction:
         device = resolve_device(config.device)
         self.config, self.strategy, self.processes = config, config.strategy(), ALONE
         self.measurements = Measurements(capture, device)
+        self._train_views, self._test_views = self.measurements.train, self.measurements.test
         self._mesh = (mesh or _grid(capture, config, self.strategy)).to(device=device)
         self.positions = VertexOptimizer(self._mesh, config.motion) if config.move else None
         self.densities = Densities(self._mesh, self.measurements.density_unit, config.rate, config.betas)
@@ -79,12 +78,6 @@ class Reconstruction:
         self._unread = Unread()
         self._description = _describe(capture)
 
-    @property
-    def mesh(self) -> TetMesh:
-        """The mesh as it is now, detached."""
-        mesh = self.positions.mesh if self.positions else self._mesh
-        return mesh.with_vertices(mesh.vertices.detach())
-
     def step(self) -> None:
         """One iteration: refines the mesh where that is due, looks along rays, moves densities and vertices.
 
@@ -93,13 +86,13 @@ class Reconstruction:
         """
         self._refine_if_due()
         config = self.config
-        rate = config.motion_rate_at(self.iteration)
-        mesh = self.positions.mesh if self.positions and rate is not None else self.mesh
-        self._unread.add(self.iteration, *self._gather(mesh))
+        rate = self._motion_rate()
+        self._unread.add(self.iteration, *self._gather(self._moving_mesh(rate)))
         self._unread.read_errors(self.history)
         self.densities.step(config.rate_at(self.iteration))
         self.alignment.step(config.align_rate * config.rate_at(self.iteration) / config.rate)
         self._move(rate)
+        self._unread.read_moves(self.history)
         self.iteration += 1
 
     def solve(self, on_step: Callable[[int], None] | None = None) -> None:
@@ -128,15 +121,14 @@ class Reconstruction:
             views: How many views; all where there are fewer.
             count: Pixels in all.
         """
-        random, scan = self.config.refinement_random(self.iteration), self.measurements
-        chosen = [scan.train[int(k)] for k in random.permutation(len(scan.train))[:views]]
+        random = self.config.refinement_random(self.iteration)
+        chosen = [self._train_views[int(k)] for k in random.permutation(len(self._train_views))[:views]]
         each = max(1, count // len(chosen))
         return [self._fixed(view, each, (float(random.random()), float(random.random()))) for view in chosen]
 
     def glance(self) -> None:
         """Notes the PSNR of line integrals of a few held-out views, for the curves; decides nothing."""
-        views = self.measurements.test
-        views = views[:: max(1, math.ceil(len(views) / _GLANCE_VIEWS))]
+        views = self._glanced_views()
         if views:
             score = self.score(views, _GLANCED_RAYS)
             self.history.evaluations.append((self.iteration, score.mean_psnr))
@@ -151,31 +143,9 @@ class Reconstruction:
         parts = [(view, self._fixed(view, pixels or self.measurements.all_pixels)) for view in views]
         return score_views(self.mesh, self.densities.detached(), self.measurements.peak, parts)
 
-    def progress(self, seconds: float) -> Progress:
-        """A summary for a display; loss and PSNR are means over the last pass through the training views."""
-        window, history = self._epoch, self.history
-        losses, psnrs = history.loss[-window:], history.psnr[-window:]
-        return Progress(
-            iteration=self.iteration,
-            iterations=self.config.steps,
-            loss=sum(losses) / max(1, len(losses)),
-            train_psnr=sum(psnrs) / max(1, len(psnrs)),
-            held_out_psnr=history.evaluations[-1][1] if history.evaluations else None,
-            cells=self.mesh.num_cells,
-            moves=history.moves,
-            refinements=len(history.refinements),
-            last_refinement=history.refinements[-1] if history.refinements else None,
-            seconds=seconds,
-        )
-
     def checkpoint(self) -> Checkpoint:
         """The state, to be saved."""
-        self._unread.read_moves(self.history)
-        tensors = {"vertices": self.mesh.vertices, "tets": self.mesh.tets}
-        tensors |= self.densities.state() | self.alignment.state()
-        if self.positions:
-            state = self.positions.state()
-            tensors |= {_POSITIONS + name: tensor for name, tensor in state.items() if name != "vertices"}
+        tensors = self._mesh_state() | self.densities.state() | self.alignment.state()
         strategy = type(self.strategy).__name__
         return Checkpoint(self.iteration, self.config, self._description, tensors, self.budget, strategy, self.history)
 
@@ -199,22 +169,15 @@ class Reconstruction:
         checkpoint.require_tensors_like(run.checkpoint().tensors)
         run.densities.restore(checkpoint.tensors)
         run.alignment.restore(checkpoint.tensors)
-        if run.positions:
-            state = {k.removeprefix(_POSITIONS): v for k, v in checkpoint.tensors.items()}
-            run.positions.restore(state)
+        run._restore_positions(checkpoint.tensors)
         run.budget, run.iteration, run.history = checkpoint.budget, checkpoint.iteration, checkpoint.history
         return run
-
-    @property
-    def _epoch(self) -> int:
-        """Iterations of one pass over the training views."""
-        return max(1, len(self.measurements.train) // self.config.batch_views)
 
     def _gather(self, mesh: TetMesh) -> tuple[torch.Tensor, torch.Tensor]:
         """Gradients of the objective over some pixels; means of the loss and of the squared error."""
         config, scan = self.config, self.measurements
         self.densities.zero_grad()
-        random = config.phases_at(self.iteration)
+        random = config.step_random(self.iteration)
         views = [scan.train[k] for k in config.views_at(self.iteration, len(scan.train))]
         each = max(1, config.rays // len(views))
         self.alignment.zero_grad()
@@ -252,18 +215,6 @@ class Reconstruction:
         image = render(mesh, self.densities.field(), part.camera, deterministic=self.config.deterministic)
         return image.optical_depth
 
-    def _move(self, rate: float | None) -> None:
-        if self.positions is None:
-            return
-        if rate is None:
-            self.positions.zero_grad()
-        elif (self.iteration + 1) % self.config.motion.every == 0:
-            self._unread.add_moves(self.positions.advance(rate))
-            self._unread.read_moves(self.history)
-
-    def _moment(self) -> Moment:
-        return Moment(self.iteration, self.config.steps, self._epoch, self.mesh.num_cells, self.budget)
-
     def _refine_if_due(self) -> None:
         if self.strategy is None or not self.strategy.is_due(self._moment()):
             return
@@ -283,27 +234,12 @@ class Reconstruction:
         judges = judgement.some()
         before = judges.error(mesh, densities.detached())
         self._apply(refinement)
-        self.history.refinements.append(
-            RefinementRecord(
-                iteration=self.iteration,
-                cells_before=mesh.num_cells,
-                cells=self.mesh.num_cells,
-                vertices=self.mesh.num_vertices,
-                removed=refinement.removed,
-                added=refinement.added,
-                flipped=refinement.flipped,
-                predicted=refinement.predicted,
-                error_before=before,
-                error_after=judges.error(self.mesh, densities.detached()),
-            )
-        )
+        self._record(refinement, mesh, (before, judges.error(self.mesh, densities.detached())))
 
     def _apply(self, refinement: Refinement) -> None:
         for change in refinement.changes:
             self.densities.carry(change)
-            if self.positions:
-                self.positions.carry(change)
-            self._mesh = change.mesh
+            self._adopt(change)
         if refinement.surplus is not None:
             self.densities.set(self.densities.values.detach() + refinement.surplus[:, 3].to(self.densities.values))
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 
@@ -60,13 +61,52 @@ def solve(
         on_step: Called with the number of steps done.
     """
     values, losses, done = start.detach().clone(), [], 0
+    rays = _Rays(mesh, unit, pixels)
     while done < steps:
-        system = _System(mesh, values, unit, pixels, objective)
+        system = _System(rays, values, objective)
         losses.append(system.loss)
         block = min(_RELINEARISED, steps - done)
         values = (values + system.descend(block, on_step, done)).clamp(min=0.0)
         done += block
     return Solution(values, losses)
+
+
+class _Rays:
+    """The linear map from densities, in units, to all line integrals, one set of pixels after the other.
+
+    Attributes:
+        mesh: The mesh.
+        unit: Density per unit of length that 1 stands for.
+    """
+
+    def __init__(self, mesh: TetMesh, unit: float, pixels: Callable[[], Iterator[PixelSet]]) -> None:
+        """Finds how far each ray goes in the mesh."""
+        self.mesh, self.unit, self._pixels = mesh, unit, pixels
+        ones = torch.ones(mesh.num_vertices, dtype=mesh.vertices.dtype, device=mesh.vertices.device)
+        with torch.no_grad():
+            self._ways = [self._integrals(ones, part) for part in pixels()]
+
+    def sets(self) -> Iterator[tuple[PixelSet, torch.Tensor]]:
+        """All sets of pixels, each with the integrals of densities of 1."""
+        return zip(self._pixels(), self._ways, strict=True)
+
+    def integrals(self, values: torch.Tensor, part: PixelSet) -> tuple[torch.Tensor, Callable[[torch.Tensor], Any]]:
+        """Line integrals of densities that are not negative, and the adjoint of the map that they come from.
+
+        Args:
+            values: (V,) densities.
+            part: The pixels.
+
+        Returns:
+            (h, w) integrals, and a function from as many factors to (V,) derivatives of the integrals' weighted sum.
+        """
+        leaf = values.detach().requires_grad_()
+        found = self._integrals(leaf, part)
+        return found.detach(), lambda worth: torch.autograd.grad(found, leaf, worth, retain_graph=True)[0]
+
+    def _integrals(self, values: torch.Tensor, part: PixelSet) -> torch.Tensor:
+        field = Field(values.new_zeros(len(values), 0), self.unit * values, "vertex")
+        return render(self.mesh, field, part.camera, deterministic=True).optical_depth
 
 
 class _System:
@@ -76,31 +116,23 @@ class _System:
         loss: The objective there.
     """
 
-    def __init__(
-        self,
-        mesh: TetMesh,
-        values: torch.Tensor,
-        unit: float,
-        pixels: Callable[[], Iterator[PixelSet]],
-        objective: Objective,
-    ) -> None:
+    def __init__(self, rays: _Rays, values: torch.Tensor, objective: Objective) -> None:
         """Looks along all rays once: loss, gradient, curvature and preconditioner."""
-        self._mesh, self._unit, self._pixels = mesh, unit, pixels
+        mesh, unit, self._rays = rays.mesh, rays.unit, rays
         self._curvatures: list[torch.Tensor] = []
-        self._ways: list[torch.Tensor] = []
         gradient, diagonal, loss, count = torch.zeros_like(values), torch.zeros_like(values), 0.0, 0
-        ones, likelihood = torch.ones_like(values), LIKELIHOODS[objective.likelihood]
-        for part in pixels():
-            residuals = likelihood(self._integrals(values, part), part.measured, part.weight)
+        likelihood = LIKELIHOODS[objective.likelihood]
+        for part, way in rays.sets():
+            found, spread = rays.integrals(values, part)
+            residuals = likelihood(found, part.measured, part.weight)
             counts = part.weight > 0
             loss += float(torch.where(counts, residuals.loss, 0.0).sum(dtype=torch.float64))
             count += int(counts.sum())
-            curvature, way = torch.where(counts, residuals.curvature, 0.0), self._integrals(ones, part)
-            gradient += self._spread(torch.where(counts, residuals.slope, 0.0), part)
+            curvature = torch.where(counts, residuals.curvature, 0.0)
+            gradient += spread(torch.where(counts, residuals.slope, 0.0))
             # Row sums bound the matrix (De Pierro 1995), and are positive wherever a ray comes by.
-            diagonal += self._spread(curvature * way, part)
+            diagonal += spread(curvature * way)
             self._curvatures.append(curvature)
-            self._ways.append(way)
         self._count = max(count, 1)
         gradient, diagonal = gradient / self._count, diagonal / self._count
         self._weights: torch.Tensor | None = None
@@ -138,28 +170,14 @@ class _System:
         shift = float((-direction).clamp(min=0.0).max())
         raised = direction + shift
         total = torch.zeros_like(direction)
-        for part, curvature, way in zip(self._pixels(), self._curvatures, self._ways, strict=True):
-            along = self._integrals(raised, part) - shift * way
-            total += self._spread(curvature * along, part)
+        for (part, way), curvature in zip(self._rays.sets(), self._curvatures, strict=True):
+            along, spread = self._rays.integrals(raised, part)
+            total += spread(curvature * (along - shift * way))
         total /= self._count
         if self._weights is not None:
-            penalty = weighted_square(self._mesh, self._unit * direction, self._weights)
-            total += self._unit * penalty.by_density.to(total)
+            penalty = weighted_square(self._rays.mesh, self._rays.unit * direction, self._weights)
+            total += self._rays.unit * penalty.by_density.to(total)
         return torch.where(self._is_held, 0.0, total)
-
-    @torch.no_grad()
-    def _integrals(self, values: torch.Tensor, part: PixelSet) -> torch.Tensor:
-        """Line integrals along the rays of some pixels."""
-        field = Field(values.new_zeros(len(values), 0), self._unit * values, "vertex")
-        return render(self._mesh, field, part.camera).optical_depth
-
-    def _spread(self, worth: torch.Tensor, part: PixelSet) -> torch.Tensor:
-        """(V,) derivatives of a sum of line integrals, each with its factor: the adjoint of :meth:`_integrals`."""
-        leaf = torch.ones(self._mesh.num_vertices, device=worth.device, dtype=worth.dtype).requires_grad_()
-        field = Field(leaf.new_zeros(len(leaf), 0), self._unit * leaf, "vertex")
-        depth = render(self._mesh, field, part.camera, deterministic=True).optical_depth
-        (spread,) = torch.autograd.grad(depth, leaf, worth)
-        return spread
 
 
 def _dot(first: torch.Tensor, second: torch.Tensor) -> float:

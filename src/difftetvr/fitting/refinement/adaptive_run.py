@@ -1,0 +1,137 @@
+"""What runs of any kind share whose mesh moves and refines itself."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+
+from difftetvr.fitting.positions import VertexOptimizer
+from difftetvr.fitting.records.history import History, RefinementRecord
+from difftetvr.fitting.records.result import Progress
+from difftetvr.fitting.records.unread import Unread
+from difftetvr.fitting.refinement.strategy import Moment, Refinement, Strategy
+from difftetvr.mesh.changes.change import MeshChange
+from difftetvr.mesh.tetmesh import TetMesh
+
+_GLANCE_VIEWS = 4
+_POSITIONS = "positions."  # prefix of the positions' state in a checkpoint
+
+
+class AdaptiveRun:
+    """A run between two iterations, as far as it is about the mesh; subclasses make it and say what is learned.
+
+    Attributes:
+        config: Options, a `difftetvr.fitting.options.Schedule`.
+        strategy: How the mesh is refined; None: not at all.
+        budget: Cells that the mesh may have.
+        positions: Vertex positions under optimisation; None where they are fixed.
+        iteration: Iterations done.
+        history: What happened so far.
+    """
+
+    config: Any
+    strategy: Strategy | None
+    budget: int
+    positions: VertexOptimizer | None
+    iteration: int
+    history: History
+    _mesh: TetMesh
+    _unread: Unread
+    _train_views: list[int]
+    _test_views: list[int]
+
+    @property
+    def mesh(self) -> TetMesh:
+        """The mesh as it is now, detached."""
+        mesh = self.positions.mesh if self.positions else self._mesh
+        return mesh.with_vertices(mesh.vertices.detach())
+
+    def progress(self, seconds: float) -> Progress:
+        """A summary for a display; loss and PSNR are means over the last pass through the training views."""
+        window, history = self._epoch, self.history
+        losses, psnrs = history.loss[-window:], history.psnr[-window:]
+        return Progress(
+            iteration=self.iteration,
+            iterations=self.config.steps,
+            loss=sum(losses) / max(1, len(losses)),
+            train_psnr=sum(psnrs) / max(1, len(psnrs)),
+            held_out_psnr=history.evaluations[-1][1] if history.evaluations else None,
+            cells=self.mesh.num_cells,
+            moves=history.moves,
+            refinements=len(history.refinements),
+            last_refinement=history.refinements[-1] if history.refinements else None,
+            seconds=seconds,
+        )
+
+    @property
+    def _epoch(self) -> int:
+        """Iterations of one pass over the training views."""
+        return max(1, len(self._train_views) // self.config.batch)
+
+    def _glanced_views(self) -> list[int]:
+        """A few held-out views, evenly spread."""
+        return self._test_views[:: max(1, math.ceil(len(self._test_views) / _GLANCE_VIEWS))]
+
+    def _moment(self) -> Moment:
+        return Moment(self.iteration, self.config.steps, self._epoch, self.mesh.num_cells, self.budget)
+
+    def _moving_mesh(self, rate: float | None) -> TetMesh:
+        """The mesh of an iteration, whose vertices gather gradients where they move at all."""
+        return self.positions.mesh if self.positions and rate is not None else self.mesh
+
+    def _motion_rate(self) -> float | None:
+        """Rate of the vertices' steps, None where they stay."""
+        held = self.strategy is not None and not self.strategy.lets_move(self._moment())
+        return None if held else self.config.motion_rate_at(self.iteration)
+
+    def _move(self, rate: float | None) -> None:
+        if self.positions is None:
+            return
+        if rate is None:
+            self.positions.zero_grad()
+        elif (self.iteration + 1) % self.config.motion.every == 0:
+            self._unread.add_moves(self.positions.advance(rate))
+
+    def _adopt(self, change: MeshChange) -> None:
+        """Follows a change of the mesh's cells."""
+        if self.positions:
+            self.positions.carry(change)
+        self._mesh = change.mesh
+
+    def _record(self, refinement: Refinement, before: TetMesh, errors: tuple[float, float]) -> None:
+        """Takes note of a refinement that has been made.
+
+        Args:
+            refinement: What it was.
+            before: The mesh before it.
+            errors: Errors before and after it.
+        """
+        self.history.refinements.append(
+            RefinementRecord(
+                iteration=self.iteration,
+                cells_before=before.num_cells,
+                cells=self.mesh.num_cells,
+                vertices=self.mesh.num_vertices,
+                removed=refinement.removed,
+                added=refinement.added,
+                flipped=refinement.flipped,
+                predicted=refinement.predicted,
+                error_before=errors[0],
+                error_after=errors[1],
+            )
+        )
+
+    def _mesh_state(self) -> dict[str, torch.Tensor]:
+        """What a checkpoint holds of the mesh and of how its vertices move, by name."""
+        tensors = {"vertices": self.mesh.vertices, "tets": self.mesh.tets}
+        if self.positions:
+            state = self.positions.state()
+            tensors |= {_POSITIONS + name: tensor for name, tensor in state.items() if name not in tensors}
+        return tensors
+
+    def _restore_positions(self, tensors: dict[str, torch.Tensor]) -> None:
+        """The inverse of :meth:`_mesh_state`, for a run that has been made with its mesh."""
+        if self.positions:
+            self.positions.restore({name.removeprefix(_POSITIONS): tensor for name, tensor in tensors.items()})
