@@ -6,7 +6,7 @@ import contextlib
 import dataclasses
 import math
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -142,27 +142,32 @@ class CaptureOptions:
         """Reads or renders the capture of that name."""
         from difftetvr.capture import load_capture
 
-        with _saying(console), waiting(console, f"Preparing the views of {name}"):
+        with saying(console), waiting(console, f"Preparing the views of {name}"):
             return load_capture(name, **self.given())
 
     def summarise(self, name: str, console: Console) -> VolumeSummary:
         """Reads the volume of that name without rendering it."""
         from difftetvr.capture.volumes.summary import summarise
 
-        with _saying(console), waiting(console, f"Reading {name}"):
+        with saying(console), waiting(console, f"Reading {name}"):
             return summarise(name, self.shape, self.dtype, self.spacing, self.value_range)
 
 
 @contextlib.contextmanager
-def _saying(console: Console) -> Iterator[None]:
-    """Context in which warnings about captures are lines of the output, once it ends well."""
+def saying(console: Console, as_words: Callable[[str], str] = str) -> Iterator[None]:
+    """Context in which warnings about captures are lines of the output, once it ends well.
+
+    Args:
+        console: Where to say them.
+        as_words: Puts what they say in the words of the command line.
+    """
     from difftetvr.capture import CaptureWarning
 
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", CaptureWarning)
         yield
     for warning in caught:
-        console.print(str(warning.message), highlight=False)
+        console.print(as_words(str(warning.message)), highlight=False)
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from difftetvr.cli.arguments import Groups
-from difftetvr.cli.options import TRUST_GROUPS, Output, TrustOptions
+from difftetvr.cli.options import TRUST_GROUPS, Output, TrustOptions, saying
 from difftetvr.errors import CaptureError, counted
 from difftetvr.files import require_writable
 from difftetvr.terminal import counting, waiting
@@ -93,14 +92,11 @@ class Project:
         console.print(f"Wrote {self.output} ({', '.join(parts)})", highlight=False)
 
     def _read(self, console: Console) -> VoxelVolume:
-        from difftetvr.capture import CaptureWarning, load_volume
+        from difftetvr.capture import load_volume
 
-        with warnings.catch_warnings(record=True) as caught, waiting(console, f"Reading {self.volume}"):
-            warnings.simplefilter("always", CaptureWarning)
-            volume = load_volume(self.volume, self.shape, self.dtype, self.value_range)
-        for warning in caught:
-            console.print(str(warning.message).replace("value_range says", "--value-range says"), highlight=False)
-        return volume
+        options = saying(console, lambda said: said.replace("value_range says", "--value-range says"))
+        with options, waiting(console, f"Reading {self.volume}"):
+            return load_volume(self.volume, self.shape, self.dtype, self.value_range)
 
     def _say_proportions(self, console: Console, volume: VoxelVolume, geometry: ProjectionGeometry) -> None:
         """Prints a line where voxels are stretched, since all of them fill the box of the geometry."""

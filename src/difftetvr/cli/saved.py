@@ -7,7 +7,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import tyro
 from tyro.conf import FlagCreatePairsOff, arg
@@ -19,6 +19,7 @@ from difftetvr.fitting.options import options_from_json
 from difftetvr.fitting.records.folder import RunFolder
 from difftetvr.trust import require_regular
 
+_Saved = TypeVar("_Saved")
 _LEFT_OPEN: dict[str, Any] = {"capture": None, "capture_options": {}, "fit": {}}
 
 
@@ -51,10 +52,7 @@ class SavedRun:
         Raises:
             FitError: The file is damaged.
         """
-        if not folder.config.is_file():
-            return None
-        refusal = f"--resume cannot use {folder.config} (start anew with --overwrite, or mend it)"
-        return _read(folder.config, {}, refusal)
+        return saved_options(folder, SavedRun)
 
     @staticmethod
     def in_file(path: Path) -> SavedRun:
@@ -66,7 +64,7 @@ class SavedRun:
         if path.is_dir():
             raise FitError(f"--config cannot use {path}: It is a folder; give a file, such as {path / 'config.json'}.")
         require_regular(path, FitError)
-        return _read(path, _LEFT_OPEN, f"--config cannot use {path}")
+        return _read(path, SavedRun, _LEFT_OPEN, f"--config cannot use {path}")
 
 
 @dataclass(frozen=True)
@@ -84,6 +82,22 @@ def saved_run(args: Sequence[str]) -> SavedRun | None:
     Raises:
         FitError: They cannot be read, or there are two places to take them from.
     """
+    origin = _origin_of(args)
+    if origin.config is not None:
+        if origin.resume:
+            raise FitError("--resume goes on with the options of the run itself; leave out --config, or --resume.")
+        return SavedRun.in_file(origin.config)
+    folder = folder_to_resume(args)
+    return None if folder is None else SavedRun.in_folder(folder)
+
+
+def folder_to_resume(args: Sequence[str]) -> RunFolder | None:
+    """The folder of the run that the arguments of ``difftetvr fit`` ask to go on with; None if they ask for none."""
+    origin = _origin_of(args)
+    return RunFolder(origin.output) if origin.resume and origin.output is not None else None
+
+
+def _origin_of(args: Sequence[str]) -> _Origin:
     try:
         origin, _ = tyro.cli(
             _Origin,
@@ -94,12 +108,8 @@ def saved_run(args: Sequence[str]) -> SavedRun | None:
             config=(FlagCreatePairsOff,),
         )
     except SystemExit:
-        return None  # What is wrong with the arguments is said when all of them are parsed.
-    if origin.config is not None:
-        if origin.resume:
-            raise FitError("--resume goes on with the options of the run itself; leave out --config, or --resume.")
-        return SavedRun.in_file(origin.config)
-    return SavedRun.in_folder(RunFolder(origin.output)) if origin.resume and origin.output is not None else None
+        return _Origin()  # What is wrong with the arguments is said when all of them are parsed.
+    return origin
 
 
 def saved_beside(model: Path) -> SavedRun | None:
@@ -124,11 +134,28 @@ def run_behind(model: Path, capture: str | None) -> SavedRun | None:
     return run if run is not None and run.is_of(capture) else None
 
 
-def _read(path: Path, base: dict[str, Any], refusal: str) -> SavedRun:
+def saved_options(folder: RunFolder, kind: type[_Saved]) -> _Saved | None:
+    """What the config.json of the run in a folder holds; None if it holds no run.
+
+    Args:
+        folder: The folder.
+        kind: Dataclass of what it is to hold.
+
+    Raises:
+        FitError: The file is damaged.
+    """
+    if not folder.config.is_file():
+        return None
+    refusal = f"--resume cannot use {folder.config} (start anew with --overwrite, or mend it)"
+    return _read(folder.config, kind, {}, refusal)
+
+
+def _read(path: Path, kind: type[_Saved], base: dict[str, Any], refusal: str) -> _Saved:
     """A run's options from JSON.
 
     Args:
         path: The file.
+        kind: Dataclass of what it is to hold.
         base: Values of what the file leaves out; all else that has no default must be in it.
         refusal: Says who cannot use the file, and what to do; what is wrong with it is added.
     """
@@ -141,6 +168,6 @@ def _read(path: Path, base: dict[str, Any], refusal: str) -> SavedRun:
     except (ValueError, RecursionError) as error:
         raise FitError(f"{refusal}: It is no JSON ({error}); correct it there.") from error
     try:
-        return options_from_json(SavedRun, base | values if isinstance(values, dict) else values)
+        return options_from_json(kind, base | values if isinstance(values, dict) else values)
     except DiffTetError as error:
         raise FitError(f"{refusal}: {error}") from error

@@ -5,8 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import shlex
-import warnings
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,10 +13,11 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import tyro
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
+from difftetvr.capture.projections.naming import is_projection_source
 from difftetvr.cli.arguments import Groups
-from difftetvr.cli.options import TRUST_GROUPS, TrustOptions
-from difftetvr.errors import DiffTetError, FitError, counted
-from difftetvr.fitting.options import options_from_json
+from difftetvr.cli.options import TRUST_GROUPS, TrustOptions, saying
+from difftetvr.cli.saved import folder_to_resume, saved_options
+from difftetvr.errors import FitError, counted
 from difftetvr.fitting.records.folder import RunFolder
 from difftetvr.inverse.tomography.config import TomographyConfig
 from difftetvr.terminal import waiting
@@ -29,10 +28,6 @@ if TYPE_CHECKING:
     from difftetvr.capture.projections.projection_capture import ProjectionCapture
     from difftetvr.inverse.tomography.loop import TomographyResult
     from difftetvr.inverse.tomography.reconstruction import Reconstruction
-
-
-_META = "meta_data.json"
-_SUFFIXES = (".h5", ".hdf5", ".nxs", ".pickle", ".pkl", ".p")
 
 
 @dataclass(frozen=True)
@@ -137,14 +132,8 @@ class FitScan:
         _say_result(console, result, compared, folder)
 
     def _read(self, console: Console) -> ProjectionCapture:
-        from difftetvr.errors import CaptureWarning
-
-        with warnings.catch_warnings(record=True) as caught, waiting(console, f"Reading {self.capture}"):
-            warnings.simplefilter("always", CaptureWarning)
-            capture = self.reading.load(self.capture)
-        for warning in caught:
-            console.print(str(warning.message), highlight=False)
-        return capture
+        with saying(console), waiting(console, f"Reading {self.capture}"):
+            return self.reading.load(self.capture)
 
     def _optimise(self, run: Reconstruction, folder: RunFolder, console: Console) -> TomographyResult:
         from difftetvr.fitting.records.progress import ProgressDisplay
@@ -163,7 +152,7 @@ class FitScan:
             raise
 
     def _require_same_run(self, folder: RunFolder) -> None:
-        saved = _saved(folder) if self.resume else None
+        saved = saved_options(folder, SavedScanRun) if self.resume else None
         if saved is None:
             return
         if Path(saved.capture).resolve() != Path(self.capture).resolve():
@@ -182,8 +171,8 @@ class FitScan:
         Raises:
             FitError: They cannot be read.
         """
-        output = _value_of(args, ("-o", "--output"))
-        saved = _saved(RunFolder(Path(output))) if "--resume" in args and output is not None else None
+        folder = folder_to_resume(args)
+        saved = None if folder is None else saved_options(folder, SavedScanRun)
         if saved is None:
             return None
         return FitScan(saved.capture, tyro.MISSING, saved.tomography, saved.scan_options)
@@ -193,50 +182,13 @@ def fits_scan(args: Sequence[str]) -> bool:
     """Whether arguments of ``difftetvr fit`` name projections, or a run to go on with that is of some."""
     options = {"-o", "--output", "--config", "--initial-mesh", "--transfer-function", "--truth", "--geometry"}
     words = [word for before, word in zip(["", *args], args) if not word.startswith("-") and before not in options]
-    if any(_names_projections(Path(word)) for word in words):
-        return True
-    output = _value_of(args, ("-o", "--output"))
-    if "--resume" not in args or output is None:
-        return False
     try:
-        return "tomography" in json.loads(RunFolder(Path(output)).config.read_bytes())
+        if any(is_projection_source(word) for word in words):
+            return True
+        folder = folder_to_resume(args)
+        return folder is not None and "tomography" in json.loads(folder.config.read_bytes())
     except (OSError, ValueError, TypeError, RecursionError):
-        return False
-
-
-def _names_projections(path: Path) -> bool:
-    """What `is_projection_source` says, without NumPy and PyTorch: help and mistakes are answered at once."""
-    suffix = path.suffix.lower()
-    try:
-        if path.is_dir():
-            return (path / _META).is_file()
-        if suffix == ".npy":
-            return path.with_suffix(".json").is_file()
-        if suffix == ".npz":
-            with zipfile.ZipFile(path) as archive:
-                return "geometry.npy" in archive.namelist()
-    except (OSError, ValueError, zipfile.BadZipFile):
-        return False
-    return suffix in _SUFFIXES or path.name == _META
-
-
-def _value_of(args: Sequence[str], names: Sequence[str]) -> str | None:
-    for word, following in zip(args, [*args[1:], None]):
-        name, _, value = word.partition("=")
-        if name in names:
-            return value or following
-    return None
-
-
-def _saved(folder: RunFolder) -> SavedScanRun | None:
-    """The run in a folder; None if it holds none."""
-    if not folder.config.is_file():
-        return None
-    refusal = f"--resume cannot use {folder.config} (start anew with --overwrite, or mend it)"
-    try:
-        return options_from_json(SavedScanRun, json.loads(folder.config.read_bytes()))
-    except (OSError, ValueError, RecursionError, DiffTetError) as error:
-        raise FitError(f"{refusal}: {error}") from error
+        return False  # What is wrong with names and files is said when they are read.
 
 
 def _say_choices(console: Console, given: TomographyConfig, run: Reconstruction, capture: ProjectionCapture) -> None:
