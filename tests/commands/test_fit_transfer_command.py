@@ -45,7 +45,7 @@ def test_it_writes_a_function_that_render_takes(simulation, tmp_path, capsys):
     shown = ["--transfer-function", str(out / "transfer_function.json"), "--width", "8", "--height", "8"]
     assert cli.main(["render", flow, "-o", str(picture), *shown, "--device", "cpu"]) == 0
     assert "run in" in fails(capsys, *command)
-    assert "knots 6, not 7" in fails(capsys, *command, "--resume", "--knots", "7")
+    assert "knots = 6, this run asks for 7" in fails(capsys, *command, "--resume", "--knots", "7")
     assert cli.main([*command, "--resume"]) == 0
     assert cli.main([*command, "--overwrite"]) == 0
 

@@ -11,7 +11,7 @@ from difftetvr.declared import require_declared
 from difftetvr.errors import FitError
 from difftetvr.fitting.cameras.options import CameraRefinement
 from difftetvr.fitting.motion import Motion
-from difftetvr.fitting.options import LARGEST_COUNT, Schedule, options_from_json, require
+from difftetvr.fitting.options import LARGEST_COUNT, Schedule, require
 from difftetvr.fitting.refinement import Exchange, Grow, Star, Strategy
 from difftetvr.mesh.limits import CELLS_PER_CUBE, MAX_CELLS, MAX_DEGREE
 
@@ -274,15 +274,6 @@ class FitConfig(Schedule):
         if self.background is None or isinstance(self.background, str):
             return BACKGROUND_COLORS["black" if self.background in (None, "black") else "white"]
         return self.background
-
-    @staticmethod
-    def from_json(values: object) -> FitConfig:
-        """The inverse of :meth:`to_json`.
-
-        Raises:
-            FitError: An option is unknown, of the wrong type or out of range.
-        """
-        return options_from_json(FitConfig, values)
 
 
 def _positive(value: float) -> bool:

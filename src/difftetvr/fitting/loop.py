@@ -161,7 +161,7 @@ def _require_kinds(capture: object, config: object, mesh: object, strategy: obje
 class Run(Protocol):
     """What iterates: a reconstruction of any kind, between two iterations."""
 
-    config: Any
+    config: Any  # a RunOptions
     history: History
     processes: Processes
     iteration: int
@@ -172,7 +172,7 @@ class Run(Protocol):
     def glance(self) -> None:
         """Notes how held-out views look, for the curves."""
 
-    def progress(self, seconds: float) -> Progress:
+    def progress(self, seconds: float) -> Any:
         """A summary for a display."""
         ...
 
@@ -181,13 +181,13 @@ class Run(Protocol):
         ...
 
 
-def iterate(trainer: Run, path: Path | None, on_progress: Callable[[Progress], None] | None) -> None:
+def iterate(trainer: Run, path: Path | None, on_progress: Callable[[Any], None] | None) -> None:
     """Iterates to the end, with glances and checkpoints on the way.
 
     Args:
         trainer: Where to begin; its options say how far to go, how often to glance and to save.
         path: Checkpoint to write.
-        on_progress: Called after every iteration.
+        on_progress: Called after every iteration, with what the run calls its progress.
 
     Raises:
         FitError: The checkpoint cannot be written, or what an iteration raises.

@@ -54,28 +54,65 @@ class OptionGroup:
         require(condition, f"{self.prefix}{name}", getattr(self, name), rule)
 
 
-class Schedule:
-    """Base of options of a run that optimises something and moves a mesh: which views and rates a step has.
-
-    All of it is a function of the options and the iteration alone, so a resumed run sees what an uninterrupted one
-    would have seen. Subclasses are dataclasses with the fields that are named here.
+class RunOptions:
+    """Base of options of a run that saves its state. Subclasses are dataclasses.
 
     Attributes:
         free: Options that a resumed run may choose anew: what changes nothing about where the optimisation goes, and
             how far it goes.
+        checkpoint_seconds: Seconds between checkpoints.
+        evaluate_every: Iterations between glances at held-out views; 0: never.
     """
 
     free: ClassVar[frozenset[str]]
-    seed: int
-    rate: float
-    final_rate: float
-    move: bool
-    motion: Any
+    checkpoint_seconds: float
+    evaluate_every: int = 0
 
     @property
     def steps(self) -> int:
         """Number of optimisation steps."""
         raise NotImplementedError
+
+    def require_same_run(self, other: RunOptions) -> None:
+        """Checks that ``other`` would take the same steps as these options of a saved run, were it of the same length.
+
+        Raises:
+            FitError: An option that decides the steps differs; names the first one.
+        """
+        differing = _first_difference(self, other, self.free)
+        if differing is not None:
+            name, mine, theirs = differing
+            raise FitError(
+                f"The saved run has {name} = {mine}, this run asks for {theirs}; resume with the same options or start "
+                "anew."
+            )
+
+    def to_json(self) -> dict[str, Any]:
+        """The options as JSON values."""
+        return dataclasses.asdict(self)  # type: ignore[call-overload]
+
+    @classmethod
+    def from_json(cls: type[_Options], values: object) -> _Options:
+        """The inverse of :meth:`to_json`.
+
+        Raises:
+            FitError: An option is unknown, of the wrong type or out of range.
+        """
+        return options_from_json(cls, values)
+
+
+class Schedule(RunOptions):
+    """Base of options of a run that optimises something and moves a mesh: which views and rates a step has.
+
+    All of it is a function of the options and the iteration alone, so a resumed run sees what an uninterrupted one
+    would have seen. Subclasses have the fields that are named here.
+    """
+
+    seed: int
+    rate: float
+    final_rate: float
+    move: bool
+    motion: Any
 
     @property
     def batch(self) -> int:
@@ -121,24 +158,6 @@ class Schedule:
     def step_random(self, iteration: int) -> np.random.Generator:
         """Chance for what a step does with its views."""
         return self._random(_STEP_STREAM, iteration)
-
-    def require_same_run(self, other: Schedule) -> None:
-        """Checks that ``other`` would take the same steps as these options of a saved run, were it of the same length.
-
-        Raises:
-            FitError: An option that decides the steps differs; names the first one.
-        """
-        differing = _first_difference(self, other, self.free)
-        if differing is not None:
-            name, mine, theirs = differing
-            raise FitError(
-                f"The saved run has {name} = {mine}, this run asks for {theirs}; resume with the same options or start "
-                "anew."
-            )
-
-    def to_json(self) -> dict[str, Any]:
-        """The options as JSON values."""
-        return dataclasses.asdict(self)  # type: ignore[call-overload]
 
     def _view(self, position: int, view_count: int) -> int:
         epoch, offset = divmod(position, view_count)

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import safetensors
 import safetensors.torch
@@ -24,30 +24,13 @@ from difftetvr.capture.capture import Capture
 from difftetvr.errors import FitError, MeshError
 from difftetvr.files import atomic_write, locked, remove_leftovers, stem_of
 from difftetvr.fitting.config import FitConfig
+from difftetvr.fitting.options import RunOptions
 from difftetvr.fitting.records.history import History
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.rendering.cameras.lens import LensCamera
 
 _VERSION = 5
 _HISTORY = ("history.loss", "history.psnr")
-
-
-class RunOptions(Protocol):
-    """Options of a run of any kind."""
-
-    @property
-    def steps(self) -> int:
-        """Iterations of the run."""
-        ...
-
-    def to_json(self) -> dict[str, Any]:
-        """The options as JSON values."""
-        ...
-
-    @staticmethod
-    def from_json(values: object) -> RunOptions:
-        """The inverse of :meth:`to_json`."""
-        ...
 
 
 @dataclass

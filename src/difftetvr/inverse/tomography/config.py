@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal, get_args
 from difftetvr.declared import require_declared
 from difftetvr.errors import FitError
 from difftetvr.fitting.motion import Motion
-from difftetvr.fitting.options import LARGEST_COUNT, Schedule, options_from_json, require
+from difftetvr.fitting.options import LARGEST_COUNT, Schedule, require
 from difftetvr.fitting.refinement import Exchange, Grow, Strategy
 from difftetvr.mesh.limits import MAX_CELLS
 
@@ -155,12 +155,3 @@ class TomographyConfig(Schedule):
         chosen: Exchange = getattr(self, self.refine)
         rounds = chosen.rounds or max(1, min(_ROUNDS, self.steps // _ITERATIONS_PER_ROUND))
         return dataclasses.replace(chosen, rounds=rounds)
-
-    @staticmethod
-    def from_json(values: object) -> TomographyConfig:
-        """The inverse of :meth:`to_json`.
-
-        Raises:
-            FitError: An option is unknown, of the wrong type or out of range.
-        """
-        return options_from_json(TomographyConfig, values)

@@ -1,4 +1,3 @@
-from . import checkpoint as checkpoint
 from . import config as config
 from . import fit as fit
 from . import knots as knots

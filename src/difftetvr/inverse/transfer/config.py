@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
+from typing import ClassVar
 
 from difftetvr.declared import require_declared
 from difftetvr.errors import FitError, shown
+from difftetvr.fitting.options import RunOptions
 
 
 @dataclass(frozen=True)
-class TransferConfig:
+class TransferConfig(RunOptions):
     """How a transfer function is fitted; the defaults are those of the benchmark.
 
     Attributes:
@@ -31,6 +32,8 @@ class TransferConfig:
     Raises:
         FitError: A value is of the wrong kind or out of range.
     """
+
+    free: ClassVar[frozenset[str]] = frozenset({"checkpoint_seconds"})
 
     knots: int = 32
     move_knots: bool = True
@@ -59,11 +62,12 @@ class TransferConfig:
         if self.value_range is not None and not -math.inf < self.value_range[0] < self.value_range[1] < math.inf:
             raise FitError(f"value_range is {shown(self.value_range)}; give two finite numbers, the smaller first.")
 
+    @property
+    def steps(self) -> int:
+        """Number of optimisation steps."""
+        return self.iterations
+
     def rate_at(self, iteration: int) -> float:
         """The learning rate of an iteration."""
         along = iteration / self.iterations
         return self.rate * (0.01 + 0.99 * 0.5 * (1.0 + math.cos(math.pi * along)))
-
-    def to_json(self) -> dict[str, Any]:
-        """All options by name."""
-        return asdict(self)

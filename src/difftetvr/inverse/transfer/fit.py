@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import functools
+import hashlib
 import json
 import os
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,12 +18,13 @@ import torch
 from difftetvr.capture.capture import Capture
 from difftetvr.capture.truth import BLACK, WHITE, Truth
 from difftetvr.errors import CaptureError, FitError, MeshError, shown
+from difftetvr.fitting.loop import iterate, one_torch_thread
 from difftetvr.fitting.metrics import psnr_of_mse
-from difftetvr.fitting.records.checkpoint import alone_with, describe_capture, require_no_folder
+from difftetvr.fitting.processes import ALONE
+from difftetvr.fitting.records.checkpoint import Checkpoint, alone_with, describe_capture
 from difftetvr.fitting.records.evaluation import Evaluation, compared
+from difftetvr.fitting.records.history import History
 from difftetvr.inputs import as_reals, require_type
-from difftetvr.interrupts import InterruptFlag
-from difftetvr.inverse.transfer.checkpoint import TransferCheckpoint, digest_of
 from difftetvr.inverse.transfer.config import TransferConfig
 from difftetvr.inverse.transfer.knots import Knots
 from difftetvr.mesh.field import Location
@@ -138,12 +140,15 @@ def fit_transfer(
         if path is not None and resume and path.exists():
             run.resume(path)
         run.require_something_seen()
-        run.iterate(path, on_progress)
+        with one_torch_thread():
+            iterate(run, path, on_progress)
         return run.result()
 
 
 class _Run:
     """A fit between two iterations."""
+
+    processes = ALONE
 
     def __init__(
         self,
@@ -172,9 +177,7 @@ class _Run:
         self.truth.keep(self.views)
         self.knots = Knots(config, start)
         self.begun = {name: tensor.clone() for name, tensor in self.knots.state().items()}
-        self.iteration = 0
-        self.losses: list[float] = []
-        self.seconds = 0.0
+        self.iteration, self.history = 0, History()
 
     def field(self, function: TransferFunction) -> ScalarField:
         known = self.known
@@ -191,31 +194,8 @@ class _Run:
             f"No view of '{self.capture.name}' sees the mesh; its cameras must be in the coordinates of the scalars."
         )
 
-    def iterate(self, path: Path | None, on_progress: Callable[[TransferProgress], None] | None) -> None:
-        config = self.config
-        if path is not None and self.iteration < config.iterations:
-            require_no_folder(path)
-            self.checkpoint().save(path)
-        begin = time.perf_counter() - self.seconds
-        saved = time.perf_counter()
-        with InterruptFlag(active=path is not None) as interrupt:
-            while self.iteration < config.iterations and not interrupt.raised:
-                loss, error = self.step()
-                self.seconds = time.perf_counter() - begin
-                if on_progress is not None:
-                    at = (self.iteration, config.iterations, loss, psnr_of_mse(error), self.seconds)
-                    on_progress(TransferProgress(*at))
-                last = self.iteration == config.iterations
-                if path is not None and (last or time.perf_counter() - saved >= config.checkpoint_seconds):
-                    self.checkpoint().save(path)
-                    saved = time.perf_counter()
-            if interrupt.raised:
-                if path is not None:
-                    self.checkpoint().save(path)
-                raise KeyboardInterrupt
-
-    def step(self) -> tuple[float, float]:
-        """One iteration; returns its loss and mean squared error."""
+    def step(self) -> None:
+        """One iteration."""
         views = self.views_now()
         self.knots.zero_grad()
         total, squares = 0.0, 0.0
@@ -237,8 +217,15 @@ class _Run:
             raise FitError(f"The loss is {shown(total)} after {self.iteration} iterations; take a smaller rate.")
         self.knots.step(self.config.rate_at(self.iteration))
         self.iteration += 1
-        self.losses.append(total)
-        return total, squares
+        self.history.loss.append(total)
+        self.history.psnr.append(psnr_of_mse(squares))
+
+    def glance(self) -> None:
+        """Nothing: some dozen knots learn no single view by heart."""
+
+    def progress(self, seconds: float) -> TransferProgress:
+        loss, psnr = self.history.loss[-1], self.history.psnr[-1]
+        return TransferProgress(self.iteration, self.config.iterations, loss, psnr, seconds)
 
     def views_now(self) -> list[int]:
         count = self.config.batch_views
@@ -262,25 +249,29 @@ class _Run:
         error = float((color.detach() - expected).square().mean()) / float(share)
         return loss, error
 
-    def checkpoint(self) -> TransferCheckpoint:
+    def checkpoint(self) -> Checkpoint:
         tensors = {**self.knots.state(), **{_BEGUN + name: tensor for name, tensor in self.begun.items()}}
-        return TransferCheckpoint(
-            self.iteration, self.config.to_json(), self.problem, self.losses, self.seconds, tensors
-        )
+        known = {"problem": self.problem}
+        return Checkpoint(self.iteration, self.config, known, tensors, self.mesh.num_cells, "none", self.history)
 
-    @property
+    @functools.cached_property
     def problem(self) -> str:
-        """What tells mesh, scalars and images from others."""
+        """What tells mesh, scalars and images from others: a SHA-256."""
         description = {k: v for k, v in describe_capture(self.capture).items() if not isinstance(v, float)}
-        return digest_of([self.mesh.vertices, self.mesh.tets, self.known.scalar], [json.dumps(description)])
+        digest = hashlib.sha256(json.dumps(description).encode())
+        for tensor in (self.mesh.vertices, self.mesh.tets, self.known.scalar):
+            digest.update(tensor.detach().cpu().contiguous().reshape(-1).numpy().data)
+        return digest.hexdigest()
 
     def resume(self, path: Path) -> None:
-        require_no_folder(path)
-        current = self.checkpoint()
-        saved = TransferCheckpoint.load(path, current.options, current.problem, current.tensors)
+        saved = Checkpoint.load(path, TransferConfig)
+        saved.config.require_same_run(self.config)
+        if saved.capture != {"problem": self.problem}:
+            raise FitError(f"The run of {path} is of other scalars or images; resume with the same or start anew.")
+        saved.require_tensors_like(self.checkpoint().tensors)
         self.knots.restore(saved.tensors)
         self.begun = {name: saved.tensors[_BEGUN + name] for name in self.begun}
-        self.iteration, self.losses, self.seconds = saved.iteration, list(saved.losses), saved.seconds
+        self.iteration, self.history = saved.iteration, saved.history
 
     def result(self) -> TransferResult:
         with torch.no_grad():
@@ -295,5 +286,5 @@ class _Run:
             for shown, views in ((function, self.views), (function, held_out), (start, self.views))
         )
         return TransferResult(
-            self.field(function), function, start, training, tested, before, self.losses, self.seconds
+            self.field(function), function, start, training, tested, before, self.history.loss, self.history.seconds
         )
