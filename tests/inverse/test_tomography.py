@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -15,6 +16,7 @@ from difftetvr.capture.projections.projection_capture import ProjectionCapture
 from difftetvr.errors import FitError
 from difftetvr.inverse.tomography import TomographyConfig, reconstruct
 from difftetvr.inverse.tomography.alignment import Alignment
+from difftetvr.inverse.tomography.densities import Densities
 from difftetvr.inverse.tomography.likelihoods import LIKELIHOODS
 from difftetvr.inverse.tomography.measurements import Measurements, as_camera, steps_for
 from difftetvr.inverse.tomography.objective import Objective
@@ -120,6 +122,12 @@ def test_cameras_stand_for_detectors_where_they_can() -> None:
     assert steps_for(512, 512, 16_384) == (4, 4) and steps_for(1, 640, 100) == (1, 7) and steps_for(3, 3, 9) == (1, 1)
 
 
+def densities_of(mesh: TetMesh, scan: Measurements, values: torch.Tensor) -> Densities:
+    densities = Densities(mesh, scan.density_unit, 0.1, (0.9, 0.99))
+    densities.values = values
+    return densities
+
+
 def test_the_solver_finds_what_dense_algebra_does() -> None:
     """Least squares without and with a penalty, on a mesh that knows the answer."""
     mesh = jittered(2)
@@ -137,7 +145,8 @@ def test_the_solver_finds_what_dense_algebra_does() -> None:
     for tikhonov in (0.0, 0.05):
         objective = Objective("gaussian", 0.0, tikhonov, 8.0)
         start = torch.ones(mesh.num_vertices, dtype=torch.float64)
-        found = solve(mesh, start, scan.density_unit, lambda: iter(parts), objective, 50).values * scan.density_unit
+        solution = solve(mesh, densities_of(mesh, scan, start), lambda: iter(parts), objective, 50)
+        found = solution.values * scan.density_unit
         hessian, right = weight / len(measured) * matrix.T @ matrix, weight / len(measured) * matrix.T @ measured
         if tikhonov:
             _, squared, _ = objective.factors(mesh, scan.density_unit)
@@ -156,9 +165,14 @@ def test_the_solver_keeps_densities_from_falling_below_zero() -> None:
     objective = Objective("gaussian", 0.0, 0.0, 8.0)
     start = torch.full((mesh.num_vertices,), 0.5)
     pixels = lambda: (scan.pixels(view, scan.all_pixels) for view in scan.train)  # noqa: E731
-    solution = solve(mesh, start, scan.density_unit, pixels, objective, 40)
+    solution = solve(mesh, densities_of(mesh, scan, start), pixels, objective, 40)
     assert bool((solution.values >= 0).all()) and solution.losses[-1] < 1e-2 * solution.losses[0]
     assert float((solution.values * scan.density_unit - density).abs().mean()) < 0.02
+    densities = densities_of(mesh, scan, start)
+    is_free = mesh.vertices[:, 0] > 0.5
+    densities.keep_free(is_free)
+    solution = solve(mesh, densities, pixels, objective, 10)
+    assert bool((solution.values[is_free] == 0).all()) and float(solution.values[~is_free].max()) > 0
 
 
 def small(**options: object) -> TomographyConfig:
@@ -231,6 +245,33 @@ def test_pixels_that_do_not_count_say_nothing() -> None:
     other = reconstruct(dataclasses.replace(capture, valid=valid, line_integrals=broken), options)
     assert torch.equal(one.field.density, other.field.density)
     assert math.isfinite(one.score.mean_psnr)
+
+
+def test_nothing_is_put_outside_of_the_support(tmp_path) -> None:
+    mesh = jittered(dtype=torch.float32)
+    capture = scan_of(mesh, ball(mesh) + 0.3, PARALLEL)  # all of the box absorbs, so outside would be used
+    inside = np.zeros((8, 8, 8), np.uint8)
+    inside[2:, 2:6, :4] = 255  # z, y, x
+    np.save(tmp_path / "inside.npy", inside)
+    for support in ("cylinder", str(tmp_path / "inside.npy")):
+        result = reconstruct(capture, small(support=support))
+        x, y, z = result.mesh.vertices.unbind(1)
+        if support == "cylinder":
+            outside = x.square() + y.square() > 1.0
+        else:
+            outside = (z < -0.5 - 1e-6) | (y < -0.5 - 1e-6) | (y > 0.5 + 1e-6) | (x > 1e-6)
+        assert 10 < int(outside.sum()) < len(outside) - 10
+        assert bool((result.field.density[outside] == 0).all()) and float(result.field.density.max()) > 0.3
+
+
+def test_a_support_that_cannot_be_is_refused(tmp_path) -> None:
+    mesh = jittered(dtype=torch.float32)
+    capture = scan_of(mesh, ball(mesh), PARALLEL)
+    with pytest.raises(dtv.CaptureError, match=r"nowhere\.npy"):
+        reconstruct(capture, small(support=str(tmp_path / "nowhere.npy")))
+    aside = ProjectionGeometry.from_dict(PARALLEL | {"volume_size": [0.5, 0.5, 2], "volume_offset": [0.6, 0, 0]})
+    with pytest.raises(dtv.CaptureError, match="no cylinder"):
+        reconstruct(dataclasses.replace(capture, geometry=aside), small(support="cylinder"))
 
 
 @pytest.mark.parametrize(

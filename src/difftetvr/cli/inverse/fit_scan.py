@@ -100,7 +100,7 @@ class FitScan:
             *("device", "resume", "overwrite"),
         ),
         "Objective": ("likelihood", "tikhonov", "rays", "batch-views", "solve-steps", "solve-rays"),
-        "Geometry": ("align", "align-rate"),
+        "Geometry": ("align", "align-rate", "support"),
         "Motion": ("move", "motion.*"),
         "Refinement": ("refine", "exchange.*", "grow.*"),
         "Optimisation": ("rate", "final-rate", "betas", "seed", "deterministic"),

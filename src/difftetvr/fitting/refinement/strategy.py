@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Protocol
 if TYPE_CHECKING:
     import torch
 
-    from difftetvr.capture.free_space import FreeSpace
     from difftetvr.mesh.changes.change import MeshChange
     from difftetvr.mesh.tetmesh import TetMesh
     from difftetvr.rendering.gauss_newton import ImageModel
@@ -39,6 +38,14 @@ class Moment:
         return self.iteration / self.iterations
 
 
+class EmptySpace(Protocol):
+    """Space that is known to be empty."""
+
+    def contains(self, places: torch.Tensor) -> torch.Tensor:
+        """(N,) bool, which of (N, 3) places are in it."""
+        ...
+
+
 @dataclass(frozen=True)
 class Situation:
     """What a strategy decides upon.
@@ -59,7 +66,7 @@ class Situation:
     moment: Moment
     model: Callable[[torch.Tensor | None], ImageModel]
     color_gradients: Callable[[], torch.Tensor]
-    free_space: FreeSpace
+    free_space: EmptySpace
 
 
 @dataclass(frozen=True)

@@ -81,6 +81,9 @@ class TomographyConfig(Schedule):
     """Learning rate in the last step; in between it falls log-linearly."""
     betas: tuple[float, float] = (0.9, 0.99)
     """Decay of Adam's first and second moments."""
+    support: str | None = None
+    """Where the object may be, all else being empty: cylinder, the largest one around the axis in the box, or the file
+    of a volume over the box, which exceeds its least value there. Default: the whole box."""
     move: bool = True
     """Whether vertices move."""
     refine: Refine = "exchange"

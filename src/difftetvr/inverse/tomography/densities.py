@@ -18,12 +18,14 @@ class Densities:
     Attributes:
         values: (V,) leaf tensor.
         unit: Density per unit of length that 1 stands for.
+        is_free: (V,) bool, where the density is and stays 0.
     """
 
     def __init__(self, mesh: TetMesh, unit: float, rate: float, betas: tuple[float, float]) -> None:
         """Half the mean density everywhere."""
         self.unit = unit
         self.values = torch.full((mesh.num_vertices,), _START, device=mesh.vertices.device).requires_grad_()
+        self.is_free = torch.zeros_like(self.values, dtype=torch.bool)
         self._optimizer = CarriedAdam([[self.values]], rate, betas)
 
     def field(self) -> Field:
@@ -36,12 +38,23 @@ class Densities:
 
     def carry(self, change: MeshChange) -> None:
         """Follows a change of the mesh; new vertices start with interpolated densities."""
+        self.is_free = self.is_free[change.parents[:, 0].long()] & ~change.is_new
         self.values = self._optimizer.carry(self.values, change.carry(self.values.detach()), change)
 
+    def keep_free(self, is_free: torch.Tensor) -> None:
+        """Makes the density 0 where nothing can be, now and after all further steps.
+
+        Args:
+            is_free: (V,) bool.
+        """
+        self.is_free = is_free
+        self._project()
+
     def set(self, values: torch.Tensor) -> None:
-        """Takes other values, (V,) in units; those below 0 become 0."""
+        """Takes other values, (V,) in units; those that cannot be become 0."""
         with torch.no_grad():
-            self.values.copy_(values.clamp(min=0.0))
+            self.values.copy_(values)
+        self._project()
 
     def zero_grad(self) -> None:
         """Forgets the gradients before the views of a step are accumulated."""
@@ -50,8 +63,7 @@ class Densities:
     def step(self, rate: float) -> None:
         """One projected Adam step with the accumulated gradients."""
         self._optimizer.step([rate])
-        with torch.no_grad():
-            self.values.clamp_(min=0.0)
+        self._project()
 
     def state(self) -> dict[str, torch.Tensor]:
         """Densities and optimiser state by name."""
@@ -63,3 +75,7 @@ class Densities:
         with torch.no_grad():
             for name, tensor in self.state().items():
                 tensor.copy_(tensors[name])
+
+    @torch.no_grad()
+    def _project(self) -> None:
+        self.values.clamp_(min=0.0).masked_fill_(self.is_free, 0.0)

@@ -9,6 +9,7 @@ import torch
 
 from difftetvr.capture.free_space import FreeSpace
 from difftetvr.capture.projections.projection_capture import ProjectionCapture
+from difftetvr.capture.projections.support import OutsideSupport
 from difftetvr.errors import FitError
 from difftetvr.fitting.beginning.requirements import resolve_device
 from difftetvr.fitting.positions import VertexOptimizer
@@ -70,6 +71,9 @@ class Reconstruction(AdaptiveRun):
         self._mesh = (mesh or _grid(capture, config, self.strategy)).to(device=device)
         self.positions = VertexOptimizer(self._mesh, config.motion) if config.move else None
         self.densities = Densities(self._mesh, self.measurements.density_unit, config.rate, config.betas)
+        nothing = FreeSpace([], [])
+        self._outside = OutsideSupport.of(config.support, capture.geometry) if config.support else nothing
+        self._keep_free()
         shift = 0.0 if config.align == "none" else self.measurements.axis_shift()
         self.alignment = Alignment(config.align, capture.geometry.shape, device, shift)
         self.objective = Objective.of(config, float((capture.geometry.bounds[1] - capture.geometry.bounds[0]).prod()))
@@ -92,6 +96,7 @@ class Reconstruction(AdaptiveRun):
         self.densities.step(config.rate_at(self.iteration))
         self.alignment.step(config.align_rate * config.rate_at(self.iteration) / config.rate)
         self._move(rate)
+        self._keep_free()  # also what has moved there
         self._unread.read_moves(self.history)
         self.iteration += 1
 
@@ -105,8 +110,7 @@ class Reconstruction(AdaptiveRun):
         each = max(1, self.config.solve_rays // max(1, len(scan.train)))
         found = solve(
             self.mesh,
-            self.densities.values,
-            self.densities.unit,
+            self.densities,
             lambda: (self._fixed(view, each) for view in scan.train),
             self.objective,
             self.config.solve_steps,
@@ -226,8 +230,7 @@ class Reconstruction(AdaptiveRun):
             return judgement.model(mesh, densities.detached(), densities.unit, steps)
 
         values = torch.nn.functional.pad(densities.values.detach()[:, None], (3, 0))
-        # Nothing is known to be empty, and there are no colours.
-        situation = Situation(mesh, values, self._moment(), model, _no_colors, FreeSpace([], []))
+        situation = Situation(mesh, values, self._moment(), model, _no_colors, self._outside)
         refinement = self.strategy.refine(situation)
         if refinement is None:
             return
@@ -236,10 +239,15 @@ class Reconstruction(AdaptiveRun):
         self._apply(refinement)
         self._record(refinement, mesh, (before, judges.error(self.mesh, densities.detached())))
 
+    def _keep_free(self) -> None:
+        if self.config.support:
+            self.densities.keep_free(self._outside.contains(self.mesh.vertices))
+
     def _apply(self, refinement: Refinement) -> None:
         for change in refinement.changes:
             self.densities.carry(change)
             self._adopt(change)
+        self._keep_free()
         if refinement.surplus is not None:
             self.densities.set(self.densities.values.detach() + refinement.surplus[:, 3].to(self.densities.values))
 

@@ -13,6 +13,7 @@ from typing import Any
 
 import torch
 
+from difftetvr.inverse.tomography.densities import Densities
 from difftetvr.inverse.tomography.likelihoods import LIKELIHOODS
 from difftetvr.inverse.tomography.measurements import PixelSet
 from difftetvr.inverse.tomography.objective import Objective
@@ -42,8 +43,7 @@ class Solution:
 
 def solve(
     mesh: TetMesh,
-    start: torch.Tensor,
-    unit: float,
+    densities: Densities,
     pixels: Callable[[], Iterator[PixelSet]],
     objective: Objective,
     steps: int,
@@ -53,17 +53,16 @@ def solve(
 
     Args:
         mesh: The mesh, which stays as it is.
-        start: (V,) densities to begin with, in units.
-        unit: Density per unit of length that 1 stands for.
+        densities: Those to begin with; where they are free they stay 0.
         pixels: Gives all measurements that count, set by set, as often as it is asked.
         objective: What is minimised.
         steps: Steps in all.
         on_step: Called with the number of steps done.
     """
-    values, losses, done = start.detach().clone(), [], 0
-    rays = _Rays(mesh, unit, pixels)
+    values, losses, done = densities.values.detach().clone(), [], 0
+    rays = _Rays(mesh, densities.unit, pixels)
     while done < steps:
-        system = _System(rays, values, objective)
+        system = _System(rays, values, densities.is_free, objective)
         losses.append(system.loss)
         block = min(_RELINEARISED, steps - done)
         values = (values + system.descend(block, on_step, done)).clamp(min=0.0)
@@ -116,7 +115,7 @@ class _System:
         loss: The objective there.
     """
 
-    def __init__(self, rays: _Rays, values: torch.Tensor, objective: Objective) -> None:
+    def __init__(self, rays: _Rays, values: torch.Tensor, is_free: torch.Tensor, objective: Objective) -> None:
         """Looks along all rays once: loss, gradient, curvature and preconditioner."""
         mesh, unit, self._rays = rays.mesh, rays.unit, rays
         self._curvatures: list[torch.Tensor] = []
@@ -140,7 +139,7 @@ class _System:
             self._weights = cell_weights(mesh, unit * values, *objective.factors(mesh, unit))
             gradient += unit * weighted_square(mesh, unit * values, self._weights).by_density.to(gradient)
         self.loss = loss / self._count + objective.penalty(mesh, unit * values, unit).value
-        self._is_held = (values <= 0) & (gradient > 0)
+        self._is_held = is_free | ((values <= 0) & (gradient > 0))
         self._gradient = torch.where(self._is_held, 0.0, gradient)
         self._inverse = 1.0 / (diagonal + _FLAT * float(diagonal.max()) + _TINY)
 
