@@ -45,6 +45,10 @@ class MemoryOrder:
         vertices = mesh.vertices.detach().index_select(0, self.vertices)
         return TetMesh.from_valid(vertices, self.topology, mesh.origin)
 
+    def in_order_of_mesh(self, rows: torch.Tensor) -> torch.Tensor:
+        """(V, ...) records of vertices as the mesh counts these, from such as kernels count them."""
+        return torch.empty_like(rows).index_copy_(0, self.vertices.long(), rows)
+
     def tables(self, backend: Backend) -> MeshTables:
         """What kernels read of the topology."""
         return self.topology.cached(f"render.tables.{backend.name}", lambda: MeshTables.of(backend, self))

@@ -51,6 +51,17 @@ class Transfer:
         """Scalar of a knot."""
         return dr.gather(self.backend.Float, self.knots, self.backend.UInt(index), active)
 
+    def at(self, scalar: Any) -> list[Any]:
+        """Density and linear RGB of a scalar."""
+        uint, float4 = self.backend.UInt, self.backend.Float4
+        interval = self.interval(scalar, True)
+        lower = uint(dr.select(interval < 0, 0, interval))
+        upper = uint(dr.select(interval + 1 < self.count, interval + 1, self.count - 1))
+        low = self.knot(lower)
+        weight = dr.fmin(dr.fmax((scalar - low) * _inverse(self.knot(upper) - low), 0.0), 1.0)
+        below, above = (dr.gather(float4, self.values, index) for index in (lower, upper))
+        return [dr.fma(weight, above[k] - below[k], below[k]) for k in range(4)]
+
     def bounded(self, values: list[Any], face: Face) -> list[Any]:
         """Distance and scalar at a face, the scalar within those of its corners.
 

@@ -10,11 +10,9 @@ from typing import Any
 
 import drjit as dr
 
-from difftetvr.mesh import TetMesh
 from difftetvr.rendering.kernels.hats.kernel import (
     PLACES,
     SAMPLES,
-    STEP_RECORD,
     HatKernel,
     HatRay,
     HatRecords,
@@ -24,7 +22,6 @@ from difftetvr.rendering.kernels.hats.kernel import (
     gathered_records,
 )
 from difftetvr.rendering.kernels.hats.tables import HatTables
-from difftetvr.rendering.search.memory_order import MemoryOrder
 from difftetvr.rendering.traversal.crossing import Tracer
 from difftetvr.rendering.traversal.rays import Lanes
 
@@ -47,20 +44,16 @@ class HatImage:
     face_steps: Any | None = None
 
 
-def hat_records(
-    tracer: Tracer, mesh: TetMesh, order: MemoryOrder, image: HatImage, in_order: bool = False
-) -> HatRecords:
-    """Sums over the rays of a view for every vertex, edge and face.
+def hat_records(tracer: Tracer, image: HatImage, space: HatSpace, in_order: bool = False) -> HatRecords:
+    """Sums over the rays of a view for every vertex, edge and face; of faces those of their steps, if there are any.
 
     Args:
         tracer: The view, to be walked through; its field lives on vertices.
-        mesh: The mesh that is seen.
-        order: Its order in memory, which is that of the records of vertices; edges and faces are in the mesh's.
         image: The rendered image, and the derivative of the loss with respect to it.
+        space: What there are hats of, with records of `RECORD` floats.
         in_order: Whether sums over rays have a certain order, see :mod:`difftetvr.rendering.kernels.shares`.
     """
-    widths = [RECORD, RECORD, RECORD if image.face_steps is None else STEP_RECORD]
-    return gathered_records(_LightHats, tracer, image, HatSpace.of(mesh, order, widths), in_order)
+    return gathered_records(_LightHats, tracer, image, space, in_order)
 
 
 class _LightHats(HatKernel):
