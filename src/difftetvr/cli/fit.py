@@ -147,10 +147,11 @@ class Fit:
 
     @staticmethod
     def variant(args: Sequence[str]) -> type:
-        """This command, or that for projections, where the arguments name some."""
-        from difftetvr.cli.inverse.fit_scan import FitScan, fits_scan  # most fits are of images
+        """This command, or that for projections or for scalars, where the arguments ask for one."""
+        from difftetvr.cli.inverse.fit_scalar import FitScalar, fits_scalar  # most fits are of colours and densities
+        from difftetvr.cli.inverse.fit_scan import FitScan, fits_scan
 
-        return FitScan if fits_scan(args) else Fit
+        return FitScalar if fits_scalar(args) else FitScan if fits_scan(args) else Fit
 
     @staticmethod
     def defaults(args: Sequence[str]) -> Fit | None:

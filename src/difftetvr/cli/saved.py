@@ -97,6 +97,20 @@ def folder_to_resume(args: Sequence[str]) -> RunFolder | None:
     return RunFolder(origin.output) if origin.resume and origin.output is not None else None
 
 
+def goes_on_with(options: str, args: Sequence[str]) -> bool:
+    """Whether arguments of ``difftetvr fit`` ask to go on with a run whose config.json has options of a kind.
+
+    Args:
+        options: Name of these options there.
+        args: The arguments.
+    """
+    try:
+        folder = folder_to_resume(args)
+        return folder is not None and options in json.loads(folder.config.read_bytes())
+    except (OSError, ValueError, TypeError, RecursionError):
+        return False  # What is wrong with the file is said when it is read.
+
+
 def _origin_of(args: Sequence[str]) -> _Origin:
     try:
         origin, _ = tyro.cli(

@@ -224,18 +224,13 @@ class Trainer(AdaptiveRun):
         config = replace(config, batch_views=config.batch_views or checkpoint.config.batch)
         asked = config.for_capture(capture)
         checkpoint.config.require_same_run(asked)
-        checkpoint.require_not_beyond(asked.steps)
         trainer = Trainer(capture, config, checkpoint.mesh(), strategy, processes)
         require_same_capture(checkpoint.capture, trainer._capture_description)
         checkpoint.require_strategy(type(trainer.strategy).__name__)
-        checkpoint.require_tensors_like(trainer.checkpoint().tensors)
+        trainer._go_on_from(checkpoint)
         trainer.parameters.restore(checkpoint.tensors)
-        trainer._restore_positions(checkpoint.tensors)
         if trainer.cameras is not None:
             trainer.cameras.restore({k.removeprefix(_CAMERAS): v for k, v in checkpoint.tensors.items()})
-        trainer.budget = checkpoint.budget
-        trainer.iteration = checkpoint.iteration
-        trainer.history = checkpoint.history
         trainer.repair = checkpoint.repair
         return trainer
 

@@ -1,6 +1,10 @@
+from . import scalars as scalars
 from . import tomography as tomography
 from . import transfer as transfer
 from . import viewpoint as viewpoint
+from .scalars.config import ScalarConfig as ScalarConfig
+from .scalars.loop import ScalarResult as ScalarResult
+from .scalars.loop import fit_scalar as fit_scalar
 from .transfer.config import TransferConfig as TransferConfig
 from .transfer.fit import TransferProgress as TransferProgress
 from .transfer.fit import TransferResult as TransferResult
@@ -16,6 +20,8 @@ from .viewpoint.search import best_viewpoint as best_viewpoint
 from .viewpoint.search import sample_viewpoints as sample_viewpoints
 
 __all__ = [
+    "ScalarConfig",
+    "ScalarResult",
     "TransferConfig",
     "TransferProgress",
     "TransferResult",
@@ -24,6 +30,7 @@ __all__ = [
     "ViewpointSearch",
     "best_viewpoint",
     "color_entropy",
+    "fit_scalar",
     "fit_transfer",
     "opacity_entropy",
     "reference_colors",

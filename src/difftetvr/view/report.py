@@ -7,10 +7,13 @@ from typing import Any
 
 from difftetvr.capture.capture import Capture
 from difftetvr.errors import CaptureError
-from difftetvr.fitting.records.evaluation import rendered_image, true_image, valid_share, where_valid
+from difftetvr.fitting.records.evaluation import Color, rendered_image, true_image, valid_share, where_valid
 from difftetvr.fitting.records.folder import RunFolder, write_json
 from difftetvr.fitting.records.result import FitResult
+from difftetvr.mesh.field import Field
 from difftetvr.mesh.io import save
+from difftetvr.mesh.tetmesh import TetMesh
+from difftetvr.rendering import ScalarField
 from difftetvr.view.cut import cut_picture
 from difftetvr.view.pictures import save_comparisons, save_picture, save_png
 from difftetvr.view.plots import save_curves
@@ -39,13 +42,26 @@ def write_report(folder: RunFolder, result: FitResult, capture: Capture) -> None
         write_json(folder.cameras, _cameras_of(capture))
     save(folder.model, result.mesh, result.field)
     save_curves(folder.curves, result.history)
-    _write_pictures(folder, result, capture)
+    write_views(folder, result.mesh, result.field, capture, result.config.evaluation_background())
     save_picture(folder.cut, cut_picture(result.mesh, result.field))
     write_json(folder.metrics, {"capture": capture.name, **result.metrics})
 
 
-def _write_pictures(folder: RunFolder, result: FitResult, capture: Capture) -> None:
-    background = result.config.evaluation_background()
+def write_views(
+    folder: RunFolder, mesh: TetMesh, field: Field | ScalarField, capture: Capture, background: Color
+) -> None:
+    """Writes pictures of some views, single ones and beside each other.
+
+    Args:
+        folder: Existing folder.
+        mesh: The mesh.
+        field: What it holds.
+        capture: The true images.
+        background: Behind the volume.
+
+    Raises:
+        CaptureError: A picture cannot be written.
+    """
     views = _spread(capture.test_indices.tolist() or capture.train_indices.tolist(), _SINGLE_VIEWS)
     compared = _spread(views, _COMPARED_VIEWS)
     rows = []
@@ -55,7 +71,7 @@ def _write_pictures(folder: RunFolder, result: FitResult, capture: Capture) -> N
         raise CaptureError(f"The folder {folder.views} cannot be created ({error.strerror}); free it.") from error
     for view in views:
         truth = true_image(capture, view, background)
-        image = rendered_image(result.mesh, result.field, capture, view, background)
+        image = rendered_image(mesh, field, capture, view, background)
         save_png(folder.views / f"{view:04d}_truth.png", truth)
         save_png(folder.views / f"{view:04d}_reconstruction.png", image)
         if view in compared:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,8 +13,9 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from difftetvr.capture.projections.naming import is_projection_source
 from difftetvr.cli.arguments import Groups
+from difftetvr.cli.inverse.run_command import Begun, RunCommand
 from difftetvr.cli.options import TRUST_GROUPS, TrustOptions, saying
-from difftetvr.cli.saved import folder_to_resume, saved_options
+from difftetvr.cli.saved import folder_to_resume, goes_on_with, saved_options
 from difftetvr.errors import FitError, counted
 from difftetvr.fitting.records.folder import RunFolder
 from difftetvr.inverse.tomography.config import TomographyConfig
@@ -75,7 +74,7 @@ class SavedScanRun:
 
 
 @dataclass(frozen=True)
-class FitScan:
+class FitScan(RunCommand):
     """Reconstruct the densities of a tetrahedral volume from projections of a tomograph."""
 
     capture: Annotated[str, Positional, arg(metavar="SCAN")]
@@ -109,50 +108,36 @@ class FitScan:
         "Output": ("evaluate-every", "checkpoint-seconds"),
     }
 
-    def run(self, console: Console) -> None:
-        """Reconstructs, and fills the output folder."""
-        from difftetvr.inverse.tomography.loop import prepare
+    def begin(self, console: Console, checkpoint: Path | None) -> Begun:
+        """See `RunCommand.begin`."""
+        from difftetvr.inverse.tomography.loop import optimise, prepare
         from difftetvr.view.scan_report import read_truth, write_scan_report
 
-        folder = RunFolder(self.output)
-        with folder.claimed():
-            self._require_same_run(folder)
-            folder.require_free(resume=self.resume, overwrite=self.overwrite)
-            capture = self._read(console)
-            truth = None if self.truth is None else read_truth(self.truth)
-            with waiting(console, "Reading the checkpoint" if self.resume else "Making the mesh to begin with"):
-                run = prepare(capture, self.config, None, folder.checkpoint if self.resume else None)
-            _say_choices(console, self.config, run, capture)
-            saved = SavedScanRun(self.capture, self.reading, run.config)
-            options = {**dataclasses.asdict(saved), "tomography": run.config.to_json()}
-            with folder.occupied(options, overwrite=self.overwrite, begun=lambda: run.iteration > 0):
-                result = self._optimise(run, folder, console)
-            with waiting(console, f"Drawing pictures into {self.output}"):
-                compared = write_scan_report(folder, result, run.measurements, truth)
-        _say_result(console, result, compared, folder)
-
-    def _read(self, console: Console) -> ProjectionCapture:
         with saying(console), waiting(console, f"Reading {self.capture}"):
-            return self.reading.load(self.capture)
-
-    def _optimise(self, run: Reconstruction, folder: RunFolder, console: Console) -> TomographyResult:
-        from difftetvr.fitting.records.progress import ProgressDisplay
-        from difftetvr.inverse.tomography.loop import optimise
+            capture = self.reading.load(self.capture)
+        truth = None if self.truth is None else read_truth(self.truth)
+        with waiting(console, "Reading the checkpoint" if checkpoint else "Making the mesh to begin with"):
+            run = prepare(capture, self.config, None, checkpoint)
+        _say_choices(console, self.config, run, capture)
+        saved = SavedScanRun(self.capture, self.reading, run.config)
 
         def on_solve(done: int) -> None:
             if not console.is_terminal:
                 console.print(f"Solving for densities: {done} of {run.config.solve_steps} steps", highlight=False)
 
-        try:
-            with ProgressDisplay(console) as display:
-                return optimise(run, folder.checkpoint, display, on_solve)
-        except KeyboardInterrupt:
-            command = shlex.join(["difftetvr", "fit", "-o", str(self.output), "--resume"])
-            console.print(f"Interrupted; continue with: {command}")
-            raise
+        def report(folder: RunFolder, result: TomographyResult) -> list[str]:
+            return _outcome(result, write_scan_report(folder, result, run.measurements, truth), folder)
 
-    def _require_same_run(self, folder: RunFolder) -> None:
-        saved = saved_options(folder, SavedScanRun) if self.resume else None
+        return Begun(
+            lambda: run.iteration,
+            {**dataclasses.asdict(saved), "tomography": run.config.to_json()},
+            lambda path, display: optimise(run, path, display, on_solve),
+            report,
+        )
+
+    def require_same_run(self, folder: RunFolder) -> None:
+        """See `RunCommand.require_same_run`."""
+        saved = saved_options(folder, SavedScanRun)
         if saved is None:
             return
         if Path(saved.capture).resolve() != Path(self.capture).resolve():
@@ -185,10 +170,9 @@ def fits_scan(args: Sequence[str]) -> bool:
     try:
         if any(is_projection_source(word) for word in words):
             return True
-        folder = folder_to_resume(args)
-        return folder is not None and "tomography" in json.loads(folder.config.read_bytes())
-    except (OSError, ValueError, TypeError, RecursionError):
-        return False  # What is wrong with names and files is said when they are read.
+    except (OSError, ValueError):
+        pass  # What is wrong with names is said when they are read.
+    return goes_on_with("tomography", args)
 
 
 def _say_choices(console: Console, given: TomographyConfig, run: Reconstruction, capture: ProjectionCapture) -> None:
@@ -206,7 +190,8 @@ def _say_choices(console: Console, given: TomographyConfig, run: Reconstruction,
         console.print(f"Chosen for these projections: --cells {run.config.cells}", highlight=False)
 
 
-def _say_result(console: Console, result: TomographyResult, compared: dict[str, Any], folder: RunFolder) -> None:
+def _outcome(result: TomographyResult, compared: dict[str, Any], folder: RunFolder) -> list[str]:
+    """Lines that say what came of it."""
     metrics = result.metrics
     held_out = "no held-out views"
     if result.score.views:
@@ -228,4 +213,4 @@ def _say_result(console: Console, result: TomographyResult, compared: dict[str, 
         f"Views:    {folder.comparison}",
         f"Curves:   {folder.curves}",
     ]
-    console.print("\n".join(lines), highlight=False)
+    return lines

@@ -67,6 +67,11 @@ class RunFolder:
         return self.path / "cameras.json"
 
     @property
+    def transfer_function(self) -> Path:
+        """What scalars look like, JSON, where the model holds some."""
+        return self.path / "transfer_function.json"
+
+    @property
     def views(self) -> Path:
         """Folder of single pictures of held-out views."""
         return self.path / "views"
@@ -86,6 +91,7 @@ class RunFolder:
             self.comparison,
             self.cut,
             self.cameras,
+            self.transfer_function,
             self.config,
         )
 

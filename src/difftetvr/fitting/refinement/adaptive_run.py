@@ -8,6 +8,7 @@ from typing import Any
 import torch
 
 from difftetvr.fitting.positions import VertexOptimizer
+from difftetvr.fitting.records.checkpoint import Checkpoint
 from difftetvr.fitting.records.history import History, RefinementRecord
 from difftetvr.fitting.records.result import Progress
 from difftetvr.fitting.records.unread import Unread
@@ -131,7 +132,18 @@ class AdaptiveRun:
             tensors |= {_POSITIONS + name: tensor for name, tensor in state.items() if name not in tensors}
         return tensors
 
-    def _restore_positions(self, tensors: dict[str, torch.Tensor]) -> None:
-        """The inverse of :meth:`_mesh_state`, for a run that has been made with its mesh."""
+    def checkpoint(self) -> Checkpoint:
+        """The state, to be saved."""
+        raise NotImplementedError
+
+    def _go_on_from(self, saved: Checkpoint) -> None:
+        """Takes over what is known of any mesh, for a run that has been made with that of a checkpoint.
+
+        Raises:
+            FitError: The checkpoint lacks something, or has come further than the options ask for.
+        """
+        saved.require_not_beyond(self.config.steps)
+        saved.require_tensors_like(self.checkpoint().tensors)
         if self.positions:
-            self.positions.restore({name.removeprefix(_POSITIONS): tensor for name, tensor in tensors.items()})
+            self.positions.restore({name.removeprefix(_POSITIONS): tensor for name, tensor in saved.tensors.items()})
+        self.budget, self.iteration, self.history = saved.budget, saved.iteration, saved.history

@@ -63,7 +63,8 @@ class _Round:
         self.values = situation.values.to(model.edges.gradient.dtype)
         middles = self.mesh.vertices[self.mesh.topology.edges.long()].mean(1)
         is_free = situation.free_space.contains(middles)
-        self.gains = bisection_gains(self.mesh, self.values, model.edges, is_free, options.start)
+        self.gains = bisection_gains(self.mesh, self.values, model.edges, is_free, options.start, situation.reach)
+        self.reach = situation.reach
         self.surplus: torch.Tensor | None = None
         self.changes: list[MeshChange] = []
         self.predicted = 0.0
@@ -74,7 +75,8 @@ class _Round:
         # A 2-3 flip makes a cell more, a 3-2 flip one less: one that a bisection could use.
         cells = torch.where(flips.kind == TWO_TO_THREE, 1, torch.where(flips.kind == THREE_TO_TWO, -1, 0))
         gain = flip_gains(flips, self.values, model) - self._price_of_a_cell(options) * cells
-        worthwhile = true_indices(gain > 0)
+        # Of changes that are too great nothing is known.
+        worthwhile = true_indices((gain > 0) & (flips.surplus(self.values).abs().amax(1) <= self.reach))
         flips, gain = flips.select(worthwhile), gain[worthwhile]
         chosen = independent_flips(flips, gain)
         # What collapses cannot take away again must not be added.

@@ -6,6 +6,7 @@ derivatives are for.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -47,7 +48,12 @@ class BisectionGains:
 
 
 def bisection_gains(
-    mesh: TetMesh, values: torch.Tensor, edges: HatDerivatives, is_free: torch.Tensor, start: float = 1.0
+    mesh: TetMesh,
+    values: torch.Tensor,
+    edges: HatDerivatives,
+    is_free: torch.Tensor,
+    start: float = 1.0,
+    reach: float = math.inf,
 ) -> BisectionGains:
     """Predicts what bisecting each edge would win.
 
@@ -57,12 +63,13 @@ def bisection_gains(
         edges: Derivatives by the hats of ``mesh.topology.edges``.
         is_free: (E,) bool, whose new vertices have to have density 0.
         start: Part of the best surplus that new vertices start with.
+        reach: Greatest surplus that is looked at.
     """
     ends = mesh.topology.edges.long()
     middle = values[ends].mean(1)
     most = torch.where(is_free, -middle[:, 3], torch.inf)
     upper = torch.cat((1.0 - middle[:, :3], most[:, None]), 1)
-    best = edges.best_step(-middle, upper, _DAMPING)
+    best = edges.best_step((-middle).clamp(min=-reach), upper.clamp(max=reach), _DAMPING)
     first = start * best
     first[:, 3] = torch.where(is_free, most, first[:, 3])
     return BisectionGains(edges.decrease(best).clamp_min(0.0), edges.decrease(first), first)

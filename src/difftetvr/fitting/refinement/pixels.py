@@ -14,7 +14,7 @@ from difftetvr.capture.truth import Color, Truth, counted_share
 from difftetvr.fitting.processes import ALONE, Processes
 from difftetvr.mesh.field import Field
 from difftetvr.mesh.tetmesh import TetMesh
-from difftetvr.rendering import Rays, render
+from difftetvr.rendering import Rays, ScalarField, render
 from difftetvr.rendering.gauss_newton import ImageModel, model_image
 from difftetvr.rendering.rays import image_order
 
@@ -68,7 +68,7 @@ class JudgedPixels:
         return replace(self, rays=rays, truth=self.truth[:, places], valid=valid)
 
     def model(
-        self, mesh: TetMesh, field: Field, deterministic: bool, face_steps: torch.Tensor | None = None
+        self, mesh: TetMesh, field: Field | ScalarField, deterministic: bool, face_steps: torch.Tensor | None = None
     ) -> ImageModel:
         """Quadratic models of the squared error; what says how great it is counts the valid pixels alone."""
         model = model_image(
@@ -84,7 +84,7 @@ class JudgedPixels:
         return replace(model, error=model.error / counted_share(self.valid))
 
     @torch.no_grad()
-    def error(self, mesh: TetMesh, field: Field) -> float:
+    def error(self, mesh: TetMesh, field: Field | ScalarField) -> float:
         """Mean squared error."""
         image = render(mesh, field, self.rays, background=torch.tensor(self.background))
         squares = (image.color - self.truth.to(image.color)).square()
@@ -150,7 +150,7 @@ class Judgement:
         return replace(self, shares=[[part.spread(max(1, part.count // 8), 0.5) for part in s] for s in self.shares])
 
     def model(
-        self, mesh: TetMesh, field: Field, deterministic: bool, face_steps: torch.Tensor | None = None
+        self, mesh: TetMesh, field: Field | ScalarField, deterministic: bool, face_steps: torch.Tensor | None = None
     ) -> ImageModel:
         """Quadratic models of the squared error, means over the views; see `model_image` for the steps."""
         sums = []
@@ -160,7 +160,7 @@ class Judgement:
         # A process may have nothing to do, and still takes part in the sum.
         return self.processes.sum(reduce(add, sums) if sums else ImageModel.zero(mesh, face_steps is not None))
 
-    def error(self, mesh: TetMesh, field: Field) -> float:
+    def error(self, mesh: TetMesh, field: Field | ScalarField) -> float:
         """Mean squared error."""
         shares = (sum(self._weight(part) * part.error(mesh, field) for part in share) for share in self.shares)
         return self.processes.sum(float(sum(shares)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
@@ -59,6 +60,7 @@ class Situation:
         color_gradients: The sum over all training views of the absolute derivatives of the loss with respect to
             each vertex's colour, (V,).
         free_space: Where densities stay 0.
+        reach: Greatest change of a value for which the models are believed.
     """
 
     mesh: TetMesh
@@ -67,6 +69,7 @@ class Situation:
     model: Callable[[torch.Tensor | None], ImageModel]
     color_gradients: Callable[[], torch.Tensor]
     free_space: EmptySpace
+    reach: float = math.inf
 
 
 @dataclass(frozen=True)

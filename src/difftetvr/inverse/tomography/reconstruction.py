@@ -162,7 +162,6 @@ class Reconstruction(AdaptiveRun):
                 further than the options ask for.
         """
         checkpoint.config.require_same_run(config)
-        checkpoint.require_not_beyond(config.steps)
         run = Reconstruction(capture, config, checkpoint.mesh())
         for name, value in run._description.items():
             if checkpoint.capture.get(name) != value:
@@ -170,11 +169,9 @@ class Reconstruction(AdaptiveRun):
                     f"The saved run used a scan with {name} = {checkpoint.capture.get(name)}, this one has {value}; "
                     "resume with the same scan or start anew."
                 )
-        checkpoint.require_tensors_like(run.checkpoint().tensors)
+        run._go_on_from(checkpoint)
         run.densities.restore(checkpoint.tensors)
         run.alignment.restore(checkpoint.tensors)
-        run._restore_positions(checkpoint.tensors)
-        run.budget, run.iteration, run.history = checkpoint.budget, checkpoint.iteration, checkpoint.history
         return run
 
     def _gather(self, mesh: TetMesh) -> tuple[torch.Tensor, torch.Tensor]:
