@@ -1,0 +1,560 @@
+/* Built from web/src by 'npm run build'; sources ed1e6e03c51815f2d8bbc4dc70f67042a887c12458a0103ec9db5c8aa584a472 */
+"use strict";(()=>{var _=Math.PI/24;function J(n,e,t){let o=new Map;n.addEventListener("pointerdown",r=>{n.setPointerCapture(r.pointerId),o.set(r.pointerId,[r.clientX,r.clientY]),n.classList.add("held")});for(let r of["pointerup","pointercancel"])n.addEventListener(r,i=>{o.delete(i.pointerId),o.size||n.classList.remove("held")});n.addEventListener("pointermove",r=>{let i=o.get(r.pointerId);if(!i)return;let a=Math.min(n.clientWidth,n.clientHeight),s=[r.clientX,r.clientY],c=[(s[0]-i[0])/a,(s[1]-i[1])/a],l=[...o].find(([h])=>h!==r.pointerId)?.[1];if(l){e.pan(c[0]/2,c[1]/2);let h=u=>Math.hypot(u[0]-l[0],u[1]-l[1]);e.zoom(h(i)/Math.max(h(s),1))}else r.shiftKey||r.buttons&6?e.pan(c[0],c[1]):e.turn(Math.PI*c[0],Math.PI*c[1]);o.set(r.pointerId,s),t()}),n.addEventListener("wheel",r=>{r.preventDefault();let i=r.deltaY*(r.deltaMode===1?16:r.deltaMode===2?400:1);e.zoom(Math.exp(Math.min(Math.max(i,-300),300)/600)),t()},{passive:!1}),n.addEventListener("contextmenu",r=>r.preventDefault()),n.addEventListener("keydown",r=>{let i=Te[r.key];!i||r.ctrlKey||r.metaKey||r.altKey||(r.preventDefault(),i(e),t())})}var Te={ArrowLeft:n=>n.turn(-_,0),ArrowRight:n=>n.turn(_,0),ArrowUp:n=>n.turn(0,-_),ArrowDown:n=>n.turn(0,_),"+":n=>n.zoom(.9),"=":n=>n.zoom(.9),"-":n=>n.zoom(1/.9),r:n=>n.reset(),R:n=>n.reset()};function f(n,e={},...t){let o=Object.assign(document.createElement(n),e);return o.append(...t),o}function g(n,...e){return f("label",{className:"row"},f("span",{},n),...e)}function X(n,e,t,o){let r=f("input",{type:"range"});return Object.assign(r,{min:String(n),max:String(e),step:String((e-n)/400)}),r.value=String(t),r.addEventListener("input",()=>o(Number(r.value))),r}function $(n,e,t){let o=f("select",{},...n.map(r=>f("option",{},r)));return o.selectedIndex=e,o.addEventListener("change",()=>t(o.selectedIndex)),o}function K(n,e){let t=f("input",{type:"checkbox",checked:n});return t.addEventListener("change",()=>e(t.checked)),t}function D(n,e){let t=f("input",{type:"color",value:L(n)});return t.addEventListener("input",()=>e(Ae(t.value))),t}function L(n){return`#${n.map(t=>Math.round(255*Math.min(Math.max(t,0),1))).map(t=>t.toString(16).padStart(2,"0")).join("")}`}function Ae(n){let[e,t,o]=[1,3,5].map(r=>parseInt(n.slice(r,r+2),16)/255);return[e,t,o]}function R(n){let e=Math.abs(n);return e!==0&&(e<.001||e>=1e6)?n.toExponential(2):String(Number(n.toPrecision(e>=1e3?6:3)))}function y(n){return String(Math.round(n)).replace(/\B(?=(\d{3})+$)/g," ")}function ke(n,e,t,o){let r=[-.4886025119029199*e,.4886025119029199*t,-.4886025119029199*n];if(o<2)return r;let[i,a,s]=[n*n,e*e,t*t];return r.push(1.0925484305920792*n*e,-1.0925484305920792*e*t,.31539156525252005*(2*s-i-a),-1.0925484305920792*n*t,.5462742152960396*(i-a)),o<3||r.push(-.5900435899266435*e*(3*i-a),2.890611442640554*n*e*t,-.4570457994644658*e*(4*s-i-a),.3731763325901154*t*(2*s-3*i-3*a),-.4570457994644658*n*(4*s-i-a),1.445305721320277*t*(i-a),-.5900435899266435*n*(i-3*a)),r}function ee(n,e,t,o,r,i){let a=t.length/3,s=o.length/a;for(let c=0;c<a;c++){let l=t[3*c]-i[0],h=t[3*c+1]-i[1],u=t[3*c+2]-i[2],d=1/(Math.hypot(l,h,u)||1),p=ke(l*d,h*d,u*d,r),[x,I,U]=[e[4*c],e[4*c+1],e[4*c+2]];for(let T=0,k=c*s;T<p.length;T++,k+=3)x+=p[T]*o[k],I+=p[T]*o[k+1],U+=p[T]*o[k+2];n[4*c]=Math.max(x,0),n[4*c+1]=Math.max(I,0),n[4*c+2]=Math.max(U,0)}}function te(n,e){let t=e.length/5,o=new Float64Array(t);for(let s=0;s<t;s++)o[s]=Se(n,e,s);let r=Uint32Array.from(o.keys()).sort((s,c)=>o[s]-o[c]),i=new Uint32Array(8*t);r.forEach((s,c)=>i.set(e.subarray(5*s,5*s+5),8*c));let a=[];return t&&j(a,n,i,0,t),{nodes:Float32Array.from(a),faces:i}}function j(n,e,t,o,r){let i=n.length;n.push(0,0,0,0,0,0,0,-1);let a;if(r-o<=3)a=Le(e,t,o,r),n[i+7]=8*o+(r-o);else{let s=o+r>>1,c=j(n,e,t,o,s),l=j(n,e,t,s,r);a=c.map((h,u)=>u<3?Math.min(h,l[u]):Math.max(h,l[u]))}for(let s=0;s<3;s++)n[i+s]=a[s],n[i+4+s]=a[3+s];return n[i+3]=n.length/8,a}function Le(n,e,t,o){let r=[1/0,1/0,1/0,-1/0,-1/0,-1/0];for(let i=t;i<o;i++)for(let a=0;a<3;a++)for(let s=0;s<3;s++){let c=n[3*e[8*i+a]+s];r[s]=Math.min(r[s],c-4e-6),r[3+s]=Math.max(r[3+s],c+4e-6)}return r}function Se(n,e,t){let o=0,r=[0,1,2].map(i=>{let a=0;for(let s=0;s<3;s++)a+=n[3*e[5*t+s]+i];return Math.min(1023,Math.max(0,Math.floor((a/3+.5)*1024)))});for(let i=9;i>=0;i--)for(let a of r)o=2*o+(a>>i&1);return o}var re=`// Linear density and linear colour along a crossing, integrated exactly: see difftetvr/optics/special.py, of which
+// this is the float32 version; its constants come with the page.
+
+// (w0, w1, T1) of a crossing whose optical depth would be a at its first density, b at its last.
+vec3 weightsOf(float a, float b) {
+  a = min(a, 1e18);
+  b = min(b, 1e18);
+  float tau = 0.5 * (a + b), v = 0.5 * (b - a);
+  if (tau > THIN) {
+    bool hidden = tau > VISIBLE;
+    float root = sqrt(max(a * a + 4.0 * VISIBLE * v, 0.0));
+    float reach = hidden ? 2.0 * VISIBLE / (a + root) : 1.0;
+    float slope = -a * reach, curve = -v * reach * reach, m0 = 0.0;
+    for (int i = 0; i < NODE_COUNT; i++) m0 += WEIGHTS[i] * exp((curve * NODES[i] + slope) * NODES[i]);
+    m0 *= reach;
+    float transmittance = exp(-tau);
+    return vec3(1.0 - m0, m0 - transmittance, transmittance);
+  }
+  float square = tau * tau;
+  float h = H_OF(tau);
+  float sine = tau * SINH_OF(square);
+  float q = square * P_OF(square) - 2.0 * v * U_OF(square, v);
+  return vec3(h * (sine + q), h * (sine - q), 1.0 - 2.0 * h * sine);
+}
+
+struct Light {
+  vec3 color;
+  float transmittance;
+};
+
+// What a piece adds; c0 and c1 are linear RGB and density at its ends.
+void absorb(inout Light light, float depth, vec4 c0, vec4 c1) {
+  float a = depth * c0.w, b = depth * c1.w;
+  if (!(a + b > 0.0)) return;
+  vec3 w = weightsOf(a, b);
+  light.color += light.transmittance * (w.x * c0.rgb + w.y * c1.rgb);
+  light.transmittance *= w.z;
+}
+`;var ne=`// Scalars through a piecewise-linear transfer function, cut at its knots: see
+// difftetvr/rendering/traversal/transfer.py.
+
+uniform sampler2D knots;  // (K, 2): scalar; linear RGB and opacity
+uniform int knotCount;
+
+float knotAt(int index) { return texelFetch(knots, ivec2(index, 0), 0).r; }
+
+// Last knot below a scalar, or at it where inclusive; -1 where there is none.
+int intervalOf(float scalar, bool inclusive) {
+  int low = 0, high = knotCount;
+  while (low < high) {
+    int middle = (low + high) >> 1;
+    float knot = knotAt(middle);
+    if (knot < scalar || (inclusive && knot == scalar)) low = middle + 1; else high = middle;
+  }
+  return low - 1;
+}
+
+void absorbScalars(inout Light light, float depth, float f0, float f1) {
+  bool rises = f1 >= f0, varies = f1 != f0;
+  int interval = intervalOf(f0, !(rises && varies));
+  float x = 0.0, f = f0, rise = varies ? f1 - f0 : 1.0;
+  for (int piece = 0; piece <= knotCount; piece++) {
+    int ahead = rises ? interval + 1 : interval;
+    bool cuts = varies && ahead >= 0 && ahead < knotCount;
+    float knot = cuts ? knotAt(ahead) : 0.0;
+    cuts = cuts && (rises ? knot <= f1 : knot >= f1);
+    float xEnd = cuts && knot != f1 ? clamp((knot - f0) / rise, x, 1.0) : 1.0;
+    float fEnd = cuts ? knot : f1;
+    if (xEnd > x) {
+      int lower = max(interval, 0), upper = min(interval + 1, knotCount - 1);
+      vec4 below = texelFetch(knots, ivec2(lower, 1), 0), above = texelFetch(knots, ivec2(upper, 1), 0);
+      float low = knotAt(lower), width = knotAt(upper) - low;
+      float inverse = width > 0.0 ? 1.0 / width : 0.0;
+      vec4 c0 = mix(below, above, clamp((f - low) * inverse, 0.0, 1.0));
+      vec4 c1 = mix(below, above, clamp((fEnd - low) * inverse, 0.0, 1.0));
+      absorb(light, depth * (xEnd - x), c0, c1);
+    }
+    if (!cuts) return;
+    interval += rises ? 1 : -1;
+    x = xEnd;
+    f = fEnd;
+  }
+}
+`;var oe=`// A ray's way through the mesh, from cell to cell: see difftetvr/rendering/traversal/walk.py for the method.
+//
+// Which face a ray leaves through is decided by signs of edge functions, which all cells around an edge must see alike.
+// There is no fused multiply-add here to make floats exact, and a compiler may use one where it pleases; so offsets
+// from the ray are whole numbers of at most 24 bits, and where a float leaves the sign open, integers decide.
+
+precision highp float;
+precision highp int;
+precision highp sampler2D;
+precision highp usampler2D;
+
+uniform sampler2D vertices;  // positions, and density or scalar where these are the vertices'
+uniform sampler2D colors;    // linear RGB, with density or scalar in w
+uniform usampler2D links;    // 4 cell + rank: the cell behind that face, and its apex
+uniform usampler2D faces;    // boundary faces in the order of the hierarchy
+uniform sampler2D nodes;     // the hierarchy
+uniform int nodeCount;
+uniform vec3 eye;
+uniform mat3 axes;           // columns: right, down, forward
+uniform vec4 lens;           // fx, fy, cx, cy in pixels
+uniform float height;
+uniform vec4 clip;           // half-space that is seen; all zero: everything
+uniform vec3 background;
+uniform float densityScale;
+uniform int mostSteps;
+
+layout(location = 0) out vec4 pixel;
+layout(location = 1) out uint audit;  // steps; bit 24: the ray was lost; bit 25: it ran out of steps
+
+const uint NONE = 0xffffffffu;
+const float INFINITE = 1e30;
+const float STEPS_PER_UNIT = 4194304.0;  // offsets are less than 2, so whole numbers below 2^23
+const float OPAQUE = 5e-4;
+
+ivec2 place(uint index) { return ivec2(int(index & WIDTH_MASK), int(index >> WIDTH_BITS)); }
+
+struct Ray {
+  vec3 origin;
+  vec3 a;
+  vec3 b;
+  vec3 direction;
+};
+
+struct Corner {
+  uint vertex;
+  vec2 offset;  // whole numbers
+  float t;
+  vec4 value;
+};
+
+Ray rayThrough(vec2 position) {
+  Ray ray;
+  ray.direction = normalize(axes * vec3((position - lens.zw) / lens.xy, 1.0));
+  // Near the mesh, so that nothing is lost where the eye is far away.
+  ray.origin = eye - dot(eye, ray.direction) * ray.direction;
+  vec3 d = ray.direction;
+  float s = d.z >= 0.0 ? 1.0 : -1.0, inverse = -1.0 / (s + d.z), xy = d.x * d.y * inverse;
+  ray.a = vec3(1.0 + s * d.x * d.x * inverse, s * xy, -s * d.x);
+  ray.b = vec3(xy, s + d.y * d.y * inverse, -d.y);
+  return ray;
+}
+
+Corner cornerAt(Ray ray, uint vertex) {
+  vec4 record = texelFetch(vertices, place(vertex), 0);
+  vec3 from = record.xyz - ray.origin;
+  vec2 offset = floor(vec2(dot(ray.a, from), dot(ray.b, from)) * STEPS_PER_UNIT + 0.5);
+  vec4 value = vec4(0.0, 0.0, 0.0, record.w);
+#ifdef VERTEX_COLORS
+  value.rgb = texelFetch(colors, place(vertex), 0).rgb;
+#endif
+  return Corner(vertex, offset, dot(ray.direction, from), value);
+}
+
+float exactEdge(ivec2 p, ivec2 q) {
+  ivec2 pHigh = p >> 12, qHigh = q >> 12, pLow = p & 4095, qLow = q & 4095;
+  int high = pHigh.x * qHigh.y - pHigh.y * qHigh.x;
+  int middle = pHigh.x * qLow.y + pLow.x * qHigh.y - pHigh.y * qLow.x - pLow.y * qHigh.x;
+  int low = pLow.x * qLow.y - pLow.y * qLow.x;
+  middle += low >> 12;
+  high += middle >> 12;
+  return float(high) * 16777216.0 + float((middle & 4095) * 4096 + (low & 4095));
+}
+
+// Twice the signed area of (ray, p, q), of which the sign is exact.
+float edgeOf(vec2 p, vec2 q) {
+  float x = p.x * q.y, y = p.y * q.x, edge = x - y;
+  if (abs(edge) > (abs(x) + abs(y)) * 2.4e-7) return edge;
+  return exactEdge(ivec2(p), ivec2(q));
+}
+
+// Ties are broken as if the ray were shifted by (eps, eps^2), and two vertices at one place by their numbers.
+bool isLeft(float edge, Corner p, Corner q) {
+  if (edge != 0.0) return edge > 0.0;
+  if (p.offset.y != q.offset.y) return p.offset.y > q.offset.y;
+  if (p.offset.x != q.offset.x) return q.offset.x > p.offset.x;
+  return p.vertex < q.vertex;
+}
+
+struct Face {
+  Corner p;
+  Corner q;
+  Corner r;
+  vec3 edges;  // opposite p, q, r
+};
+
+Face faceOf(Corner p, Corner q, Corner r) {
+  return Face(p, q, r, vec3(edgeOf(q.offset, r.offset), edgeOf(r.offset, p.offset), edgeOf(p.offset, q.offset)));
+}
+
+bool holdsRay(Face face) {
+  return isLeft(face.edges.x, face.q, face.r) && isLeft(face.edges.y, face.r, face.p) &&
+         isLeft(face.edges.z, face.p, face.q);
+}
+
+vec3 weightsOn(Face face) {
+  float sum = face.edges.x + face.edges.y + face.edges.z;
+  return sum > 0.0 ? max(face.edges, 0.0) / sum : vec3(1.0, 0.0, 0.0);
+}
+
+float distanceTo(Face face) {
+  vec3 w = weightsOn(face);
+  return w.x * face.p.t + w.y * face.q.t + w.z * face.r.t;
+}
+
+Face boundaryFace(Ray ray, int index) {
+  uvec4 record = texelFetch(faces, place(uint(2 * index)), 0);
+  return faceOf(cornerAt(ray, record.x), cornerAt(ray, record.y), cornerAt(ray, record.z));
+}
+
+// The next boundary face through which the ray enters, after that at (reached, last); -1: none.
+int nextEntry(Ray ray, inout float reached, int last) {
+  vec3 d = ray.direction;
+  d = mix(d, vec3(1e-12), lessThan(abs(d), vec3(1e-12)));
+  vec3 inverse = 1.0 / d;
+  int found = -1;
+  float nearest = INFINITE;
+  for (int node = 0; node < nodeCount;) {
+    vec4 lower = texelFetch(nodes, place(uint(2 * node)), 0), upper = texelFetch(nodes, place(uint(2 * node + 1)), 0);
+    vec3 x = (lower.xyz - ray.origin) * inverse, y = (upper.xyz - ray.origin) * inverse;
+    vec3 low = min(x, y), high = max(x, y);
+    float first = max(max(low.x, low.y), low.z), end = min(min(high.x, high.y), high.z);
+    // Distances to boxes and to faces are rounded differently.
+    bool meets = first <= end && end >= reached - 1e-5 && first <= nearest + 1e-5;
+    if (meets && upper.w >= 0.0) {
+      int begin = int(upper.w) >> 3, count = int(upper.w) & 7;
+      for (int index = begin; index < begin + count; index++) {
+        Face face = boundaryFace(ray, index);
+        if (!holdsRay(face)) continue;
+        float t = distanceTo(face);
+        bool isAhead = t > reached || (t == reached && index > last);
+        if (isAhead && (t < nearest || (t == nearest && index < found))) {
+          nearest = t;
+          found = index;
+        }
+      }
+    }
+    node = meets ? node + 1 : int(lower.w);
+  }
+  reached = nearest;
+  return found;
+}
+
+struct Span {
+  float near;
+  float far;
+};
+
+// What of the ray is looked at: what lies before the eye, on the right side of the plane.
+Span spanOf(Ray ray) {
+  Span span = Span(dot(eye - ray.origin, ray.direction), INFINITE);
+  float slope = dot(clip.xyz, ray.direction), at = dot(clip.xyz, ray.origin) + clip.w;
+  if (slope > 0.0) span.near = max(span.near, -at / slope);
+  else if (slope < 0.0) span.far = -at / slope;
+  else if (at < 0.0) span.far = -INFINITE;
+  return span;
+}
+
+// The part of a crossing that lies in the span.
+void absorbCrossing(inout Light light, Span span, float t0, vec4 v0, float t1, vec4 v1) {
+  float first = max(t0, span.near), end = min(t1, span.far);
+  if (!(end > first)) return;
+  vec4 slope = (v1 - v0) / (t1 - t0);
+  vec4 c1 = end < t1 ? v0 + (end - t0) * slope : v1;
+  vec4 c0 = first > t0 ? v0 + (first - t0) * slope : v0;
+#ifdef SCALARS
+  absorbScalars(light, (end - first) * densityScale, c0.w, c1.w);
+#else
+  absorb(light, (end - first) * densityScale, c0, c1);
+#endif
+}
+
+vec4 interpolated(Face face) {
+  vec3 w = weightsOn(face);
+  return w.x * face.p.value + w.y * face.q.value + w.z * face.r.value;
+}
+
+// From an entry to the boundary; whether the ray goes on behind it.
+bool walk(Ray ray, Span span, int entry, inout Light light, inout uint steps) {
+  Face face = boundaryFace(ray, entry);
+  uint apex = texelFetch(faces, place(uint(2 * entry)), 0).w;
+  uint cell = texelFetch(faces, place(uint(2 * entry + 1)), 0).x;
+  float t0 = distanceTo(face);
+  vec4 v0 = interpolated(face);
+  for (;; steps++) {
+    if ((steps & 0xffffffu) >= uint(mostSteps)) {
+      steps |= 1u << 25;
+      return false;
+    }
+    Corner c = cornerAt(ray, apex);
+    vec3 to = vec3(edgeOf(face.p.offset, c.offset), edgeOf(face.q.offset, c.offset), edgeOf(face.r.offset, c.offset));
+    bool leftP = isLeft(to.x, face.p, c), leftQ = isLeft(to.y, face.q, c), leftR = isLeft(to.z, face.r, c);
+    // The apex takes the place of one corner: of the one that lies between a left and a right edge.
+    uint dropped;
+    if (leftR && !leftQ) {
+      dropped = face.p.vertex;
+      face.edges = vec3(face.edges.x, to.z, -to.y);
+      face.p = c;
+    } else if (leftP && !leftR) {
+      dropped = face.q.vertex;
+      face.edges = vec3(-to.z, face.edges.y, to.x);
+      face.q = c;
+    } else if (leftQ && !leftP) {
+      dropped = face.r.vertex;
+      face.edges = vec3(to.y, -to.x, face.edges.z);
+      face.r = c;
+    } else {
+      steps |= 1u << 24;
+      return true;
+    }
+    float t1 = distanceTo(face);
+#ifdef CELLS
+    vec4 v1 = texelFetch(colors, place(cell), 0);
+    v0 = v1;
+#else
+    vec4 v1 = interpolated(face);
+#endif
+    absorbCrossing(light, span, t0, v0, t1, v1);
+    if (light.transmittance <= OPAQUE || t1 >= span.far) return false;
+    // Rows of a cell are in the order of its vertices.
+    uint rank = uint(face.p.vertex < dropped) + uint(face.q.vertex < dropped) + uint(face.r.vertex < dropped);
+    uvec4 behind = texelFetch(links, place(4u * cell + rank), 0);
+    if (behind.x == NONE) {
+      steps++;
+      return true;
+    }
+    cell = behind.x;
+    apex = behind.y;
+    t0 = t1;
+    v0 = v1;
+  }
+}
+
+void main() {
+  Ray ray = rayThrough(vec2(gl_FragCoord.x, height - gl_FragCoord.y));
+  Light light = Light(vec3(0.0), 1.0);
+  uint steps = 0u;
+  // The mesh lies in a ball around the origin.
+  if (dot(ray.origin, ray.origin) < 0.76) {
+    Span span = spanOf(ray);
+    float reached = -INFINITE;
+    int entry = -1;
+    while ((entry = nextEntry(ray, reached, entry)) >= 0) {
+      if (reached >= span.far || !walk(ray, span, entry, light, steps)) break;
+    }
+  }
+  pixel = vec4(light.color + light.transmittance * background, 1.0);
+  audit = steps;
+}
+`;var ie=`#version 300 es
+void main() {
+  // One triangle that covers the screen.
+  gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0, 0.0, 1.0);
+}`,Oe=`#version 300 es
+precision highp float;
+uniform sampler2D source;
+uniform vec2 size;
+out vec4 pixel;
+void main() { pixel = vec4(texture(source, gl_FragCoord.xy / size).rgb, 1.0); }`;function ae(n){return ce(n,ie,Oe)}function se(n,e,t){let o=e.location==="cell",r=e.kind==="scalar",a=["#version 300 es",...[o?"CELLS":r?"":"VERTEX_COLORS",r?"SCALARS":""].filter(Boolean).map(s=>`#define ${s}`),`#define WIDTH_BITS ${t}u`,`#define WIDTH_MASK ${2**t-1}u`,"precision highp float;",Ce(e.optics),re,r?`precision highp sampler2D;
+`+ne:"",oe].join(`
+`);return ce(n,ie,a)}function Ce(n){let e=t=>`float[](${t.map(A).join(", ")})`;return[`const float THIN = ${A(n.thin)}, VISIBLE = ${A(n.visible)};`,`const int NODE_COUNT = ${n.nodes.length};`,`const float NODES[NODE_COUNT] = ${e(n.nodes)};`,`const float WEIGHTS[NODE_COUNT] = ${e(n.weights)};`,`float H_OF(float x) { return ${M(n.h.map(A),"x")}; }`,`float SINH_OF(float x) { return ${M(n.sinh.map(A),"x")}; }`,`float P_OF(float x) { return ${M(n.p.map(A),"x")}; }`,`float U_OF(float x, float y) { return ${M(n.u.map(t=>M(t.map(A),"x")),"y")}; }`].join(`
+`)}function A(n){let e=String(n);return/[.e]/.test(e)?e:`${e}.0`}function M(n,e){return n.reduceRight((t,o)=>`(${o} + ${e} * ${t})`)}function ce(n,e,t){let o=n.createProgram();for(let[r,i]of[[n.VERTEX_SHADER,e],[n.FRAGMENT_SHADER,t]]){let a=n.createShader(r);n.shaderSource(a,i),n.compileShader(a),n.attachShader(o,a),n.deleteShader(a)}if(n.linkProgram(o),!n.getProgramParameter(o,n.LINK_STATUS)){let r=(n.getAttachedShaders(o)??[]).map(i=>n.getShaderInfoLog(i));throw new Error(`The shaders of this page do not compile here: ${r.join(" ")} ${n.getProgramInfoLog(o)}`)}return o}var Ie=[[1,3,2],[0,2,3],[0,3,1],[0,1,2]],Ue=[[1,2,3],[0,2,3],[0,1,3],[0,1,2]];function le(n,e){let t=n.length,o=new Uint32Array(2*t).fill(4294967295),r=2**Math.ceil(Math.log2(2*t)),i=new Int32Array(r).fill(-1),a=(c,l)=>n[(c&-4)+Ue[c&3][l]],s=0;for(let c=0;c<t;c++){let[l,h,u]=[a(c,0),a(c,1),a(c,2)],d=Ne(l,h,u)&r-1;for(;i[d]>=0;d=d+1&r-1){let x=i[d];if(a(x,0)===l&&a(x,1)===h&&a(x,2)===u)break}let p=i[d];p<0?(i[d]=c,s++):(o.set([p>>2,n[p]],2*c),o.set([c>>2,n[c]],2*p),s--)}return{links:o,boundary:_e(n,e,o,s)}}function Ne(n,e,t){let o=Math.imul(n,2654435761)^Math.imul(e,2246822507)^Math.imul(t,3266489909);return o^=o>>>15,o=Math.imul(o,739982445),(o^o>>>13)>>>0}function _e(n,e,t,o){let r=new Uint32Array(5*o),i=0;for(let a=0;a<n.length;a++){if(t[2*a]!==4294967295)continue;let s=a>>2,[c,l,h]=Ie[a&3].map(u=>n[4*s+u]);r.set(e[s]?[c,h,l,n[a],s]:[c,l,h,n[a],s],5*i++)}return r}var Y=16384,S=class{constructor(e,t,o){this.gl=e;this.width=t;this.height=o;this.frame=e.createFramebuffer(),e.bindFramebuffer(e.FRAMEBUFFER,this.frame),this.color=this.attached(0,e.RGBA8,e.LINEAR),this.records=this.attached(1,e.R32UI,e.NEAREST),e.drawBuffers([e.COLOR_ATTACHMENT0,e.COLOR_ATTACHMENT1])}pixels(){let{gl:e,width:t,height:o}=this,r=new Uint8Array(4*t*o);e.bindFramebuffer(e.READ_FRAMEBUFFER,this.frame),e.readBuffer(e.COLOR_ATTACHMENT0),e.readPixels(0,0,t,o,e.RGBA,e.UNSIGNED_BYTE,r);let i=new Uint8Array(r.length);for(let a=0;a<o;a++)i.set(r.subarray(4*t*a,4*t*(a+1)),4*t*(o-1-a));return i}audit(){let{gl:e,width:t,height:o}=this,r=new Uint32Array(t*o);e.bindFramebuffer(e.READ_FRAMEBUFFER,this.frame),e.readBuffer(e.COLOR_ATTACHMENT1),e.readPixels(0,0,t,o,e.RED_INTEGER,e.UNSIGNED_INT,r),e.readBuffer(e.COLOR_ATTACHMENT0);let i={rays:r.length,mostSteps:0,meanSteps:0,lost:0,bounded:0};for(let a of r){let s=a&16777215;i.mostSteps=Math.max(i.mostSteps,s),i.meanSteps+=s/r.length,i.lost+=a>>24&1,i.bounded+=a>>25&1}return i}delete(){this.gl.deleteTexture(this.color),this.gl.deleteTexture(this.records),this.gl.deleteFramebuffer(this.frame)}attached(e,t,o){let{gl:r}=this,i=r.createTexture();r.bindTexture(r.TEXTURE_2D,i),r.texStorage2D(r.TEXTURE_2D,1,t,this.width,this.height);for(let a of[r.TEXTURE_MIN_FILTER,r.TEXTURE_MAG_FILTER])r.texParameteri(r.TEXTURE_2D,a,o);for(let a of[r.TEXTURE_WRAP_S,r.TEXTURE_WRAP_T])r.texParameteri(r.TEXTURE_2D,a,r.CLAMP_TO_EDGE);return r.framebufferTexture2D(r.FRAMEBUFFER,r.COLOR_ATTACHMENT0+e,r.TEXTURE_2D,i,0),i}},H=class{constructor(e,t){this.gl=e;this.volume=t;this.uniforms=new Map;this.textures=new Map;this.knotCount=0;this.seenBy="";let{header:o,positions:r,cells:i,odd:a,values:s}=t;this.widthBits=e.getParameter(e.MAX_TEXTURE_SIZE)>=4096?12:11,this.program=se(e,o,this.widthBits),this.copying=ae(e);let c=le(i,a),l=te(r,c.boundary);this.nodeCount=l.nodes.length/8;let h=new Float32Array(4*o.vertices);for(let d=0;d<o.vertices;d++)h.set(r.subarray(3*d,3*d+3),4*d),o.location==="vertex"&&(h[4*d+3]=s[4*d+3]);this.addTable("vertices",e.RGBA32F,h,4),this.addTable("links",e.RG32UI,c.links,2),this.addTable("faces",e.RGBA32UI,l.faces,4),this.addTable("nodes",e.RGBA32F,l.nodes,4),this.places=t.harmonics?De(t):null,this.seen=s.slice();let u=o.kind==="color"||o.location==="cell";this.addTable("colors",e.RGBA32F,u?this.seen:new Float32Array(4),4),o.transfer&&this.setTransfer(o.transfer)}setTransfer(e){let{gl:t}=this,o=e.scalar.length,r=new Float32Array(8*o);for(let i=0;i<o;i++)r[4*i]=e.scalar[i],r.set([...e.color[i],e.opacity[i]*e.density],4*(o+i));t.bindTexture(t.TEXTURE_2D,this.textureOf("knots")),t.texImage2D(t.TEXTURE_2D,0,t.RGBA32F,o,2,0,t.RGBA,t.FLOAT,r),this.knotCount=o}draw(e,t,o,r=0,i=t.height){let{gl:a}=this;this.colorFor(t.eye,o.directional),a.useProgram(this.program),a.bindFramebuffer(a.FRAMEBUFFER,e.frame),a.viewport(0,0,t.width,t.height),a.enable(a.SCISSOR_TEST),a.scissor(0,r,t.width,i-r);let s=0;for(let[c,l]of this.textures)a.activeTexture(a.TEXTURE0+s),a.bindTexture(a.TEXTURE_2D,l),a.uniform1i(this.uniform(c),s++);a.uniform3fv(this.uniform("eye"),t.eye),a.uniformMatrix3fv(this.uniform("axes"),!1,[...t.right,...t.down,...t.forward]),a.uniform4fv(this.uniform("lens"),t.lens),a.uniform1f(this.uniform("height"),t.height),a.uniform4fv(this.uniform("clip"),o.clip??[0,0,0,0]),a.uniform3fv(this.uniform("background"),o.background),a.uniform1f(this.uniform("densityScale"),o.density),a.uniform1i(this.uniform("nodeCount"),this.nodeCount),a.uniform1i(this.uniform("knotCount"),this.knotCount),a.uniform1i(this.uniform("mostSteps"),Y),a.drawArrays(a.TRIANGLES,0,3),a.disable(a.SCISSOR_TEST),a.activeTexture(a.TEXTURE0)}present(e){let{gl:t}=this;t.useProgram(this.copying),t.bindFramebuffer(t.FRAMEBUFFER,null),t.viewport(0,0,t.drawingBufferWidth,t.drawingBufferHeight),t.bindTexture(t.TEXTURE_2D,e.color),t.uniform2f(t.getUniformLocation(this.copying,"size"),t.drawingBufferWidth,t.drawingBufferHeight),t.drawArrays(t.TRIANGLES,0,3),t.bindTexture(t.TEXTURE_2D,null)}colorFor(e,t){let{harmonics:o,values:r}=this.volume,i=t?e.join():"";!o||!this.places||i===this.seenBy||(t?ee(this.seen,r,this.places,o.coefficients,o.degree,e):this.seen.set(r),this.addTable("colors",this.gl.RGBA32F,this.seen,4),this.seenBy=i)}uniform(e){return this.uniforms.has(e)||this.uniforms.set(e,this.gl.getUniformLocation(this.program,e)),this.uniforms.get(e)}textureOf(e){let{gl:t}=this,o=this.textures.get(e);if(o)return o;let r=t.createTexture();this.textures.set(e,r),t.bindTexture(t.TEXTURE_2D,r);for(let i of[t.TEXTURE_MIN_FILTER,t.TEXTURE_MAG_FILTER])t.texParameteri(t.TEXTURE_2D,i,t.NEAREST);return r}addTable(e,t,o,r){let{gl:i}=this,a=2**this.widthBits,s=o.length/r,c=Math.max(1,Math.ceil(s/a));if(c>i.getParameter(i.MAX_TEXTURE_SIZE))throw new Error("This browser's textures are too small for a volume of so many cells; open it on another machine.");let l=t===i.RGBA32F?i.RGBA:r===2?i.RG_INTEGER:i.RGBA_INTEGER,h=o instanceof Float32Array?i.FLOAT:i.UNSIGNED_INT,u=!this.textures.has(e);i.bindTexture(i.TEXTURE_2D,this.textureOf(e)),u&&i.texStorage2D(i.TEXTURE_2D,1,t,a,c);let d=Math.floor(s/a),p=o.subarray(d*a*r);d&&i.texSubImage2D(i.TEXTURE_2D,0,0,0,a,d,l,h,o,0),p.length&&i.texSubImage2D(i.TEXTURE_2D,0,0,d,p.length/r,1,l,h,p,0)}};function De(n){let{header:e,positions:t,cells:o}=n;if(e.location==="vertex")return t;let r=new Float32Array(3*e.cells);return o.forEach((i,a)=>{for(let s=0;s<3;s++)r[3*(a>>2)+s]+=t[3*i+s]/4}),r}var v=264,w=132,m=9,He=12,V=class{constructor(e,t,o){this.original=e;this.changed=o;this.knots=[];this.chosen=-1;this.canvas=f("canvas",{className:"curve",tabIndex:0});this.picker=D([1,1,1],e=>this.paint(e));this.note=f("output");this.histogram=Pe(t),this.canvas.setAttribute("aria-label","Opacity of scalars: knots to drag");let r=f("button",{type:"button",textContent:"Reset"});r.addEventListener("click",()=>this.reset()),this.element=f("div",{},this.canvas,f("div",{className:"ends"},R(e.range[0]),this.note,R(e.range[1])),g("Colour of the knot",this.picker,r),f("p",{className:"hint"},"Drag knots; double-click adds or removes one."));let i=Math.max(1,window.devicePixelRatio);[this.canvas.width,this.canvas.height]=[v*i,w*i],this.canvas.getContext("2d").scale(i,i),this.listen(),this.load()}load(){let{scalar:e,opacity:t,color:o}=this.original;this.knots=e.map((r,i)=>({scalar:r,opacity:t[i],color:o[i]})),this.choose(-1)}reset(){this.load(),this.tell()}tell(){this.changed({...this.original,scalar:this.knots.map(e=>e.scalar),opacity:this.knots.map(e=>e.opacity),color:this.knots.map(e=>e.color)}),this.draw()}choose(e){this.chosen=e,this.picker.disabled=e<0,e>=0&&(this.picker.value=L(this.knots[e].color)),this.draw()}paint(e){this.chosen<0||(this.knots[this.chosen].color=e,this.tell())}listen(){let{canvas:e}=this,t=!1,o=r=>{let i=e.getBoundingClientRect();return[(r.clientX-i.left)*v/i.width,(r.clientY-i.top)*w/i.height]};e.addEventListener("pointerdown",r=>{e.setPointerCapture(r.pointerId);let[i,a]=o(r);this.choose(this.nearest(i,a)),t=this.chosen>=0}),e.addEventListener("pointermove",r=>{if(!t)return;let[i,a]=o(r);this.move(P(i),de(a))}),e.addEventListener("pointerup",()=>t=!1),e.addEventListener("dblclick",r=>{let[i,a]=o(r),s=this.nearest(i,a);s>=0?this.remove(s):this.insert(P(i),de(a))}),e.addEventListener("keydown",r=>{(r.key==="Delete"||r.key==="Backspace")&&this.remove(this.chosen)})}nearest(e,t){let[o,r]=[-1,He];return this.knots.forEach((i,a)=>{let s=Math.hypot(he(i.scalar)-e,F(i.opacity)-t);s<r&&([o,r]=[a,s])}),o}move(e,t){let o=this.knots[this.chosen],[r,i]=[this.knots[this.chosen-1]?.scalar??0,this.knots[this.chosen+1]?.scalar??1];o.scalar=Math.min(Math.max(e,r),i),o.opacity=t,this.tell()}insert(e,t){let o=this.knots.filter(r=>r.scalar<=e).length;this.knots.splice(o,0,{scalar:e,opacity:t,color:this.valueAt(e).color}),this.choose(o),this.tell()}remove(e){e<0||this.knots.length<2||(this.knots.splice(e,1),this.choose(-1),this.tell())}valueAt(e){let t=this.knots.findIndex(c=>c.scalar>e);if(t<0)return this.knots[this.knots.length-1];if(t===0)return this.knots[0];let[o,r]=[this.knots[t-1],this.knots[t]],i=(e-o.scalar)/(r.scalar-o.scalar||1),a=(c,l)=>c+i*(l-c),s=o.color.map((c,l)=>a(c,r.color[l]));return{scalar:e,opacity:a(o.opacity,r.opacity),color:s}}draw(){let e=this.canvas.getContext("2d");e.clearRect(0,0,v,w);let t=w-m,o=(v-2*m)/this.histogram.length;e.fillStyle="rgb(255 255 255 / 0.13)",this.histogram.forEach((r,i)=>{e.fillRect(m+i*o,t-r*(t-m),o,r*(t-m))});for(let r=m;r<v-m;r++){let i=this.valueAt(P(r+.5));e.fillStyle=`${L(i.color)}d0`,e.fillRect(r,F(i.opacity),1,t-F(i.opacity)),e.fillStyle=L(i.color),e.fillRect(r,t,1,m-2)}e.strokeStyle="rgb(255 255 255 / 0.85)",e.lineWidth=1.5,e.beginPath();for(let r=m;r<=v-m;r++)e.lineTo(r,F(this.valueAt(P(r)).opacity));e.stroke(),this.knots.forEach((r,i)=>{e.beginPath(),e.arc(he(r.scalar),F(r.opacity),i===this.chosen?6.5:5,0,7),e.fillStyle=L(r.color),e.fill(),e.strokeStyle=i===this.chosen?"#7cc4ff":"#fff",e.lineWidth=i===this.chosen?2.5:1.5,e.stroke()}),this.note.textContent=this.chosen<0?"":this.describe(this.knots[this.chosen])}describe(e){let[t,o]=this.original.range;return`${R(t+e.scalar*(o-t))}: opacity ${R(e.opacity)}`}},he=n=>m+n*(v-2*m),P=n=>Math.min(Math.max((n-m)/(v-2*m),0),1),F=n=>w-m-Math.sqrt(n)*(w-2*m),de=n=>Math.min(Math.max((w-m-n)/(w-2*m),0),1)**2;function Pe(n){let e=new Array(66).fill(0);for(let o=3;o<n.length;o+=4)n[o]>=0&&n[o]<=1&&e[Math.min(65,Math.floor(n[o]*66))]++;let t=Math.max(1,...e);return e.map(o=>Math.sqrt(o/t))}var Ve=[.5,1,2],fe=["x","y","z"];function ue(n,e,t,o){let{header:r}=n,i=f("div",{className:"body"});if(r.transfer){let h=new V(r.transfer,n.values,u=>{e.setTransfer(u),t.change()});i.append(Q(r.scalar??"Scalar",h.element))}i.append(Q("Picture",...Be(n,t,o)),Q("Cut",...Ge(t))),i.append(qe(n,t));let a=f("button",{type:"button",className:"toggle",title:"Show or hide the panel"}),s=f("h1",{},r.title),c=f("aside",{className:"panel"},f("header",{},s,a),i),l=h=>{c.classList.toggle("closed",!h),a.textContent=h?"−":"+",a.setAttribute("aria-expanded",String(h))};return a.addEventListener("click",()=>l(c.classList.contains("closed"))),l(window.innerWidth>=700),c}function Q(n,...e){return f("section",{},f("h2",{},n),...e)}function Be(n,e,t){let{look:o}=e,r=d=>p=>{d(p),e.change()},i=X(-3,3,0,r(d=>o.density=2**d)),s=$(["Fast","Normal","Fine"],1,r(d=>e.quality=Ve[d])),c=D(o.background,r(d=>o.background=d));c.addEventListener("input",()=>document.documentElement.style.background=c.value);let l=[g("Density",i),g("Quality",s),g("Background",c)];if(n.harmonics){let d=K(!0,r(p=>o.directional=p));l.push(g("Colour by direction",d))}let h=f("button",{type:"button",textContent:"Reset view"});h.addEventListener("click",()=>{t.reset(),e.change()});let u=f("button",{type:"button",textContent:"Save picture"});return u.addEventListener("click",async()=>{let d=await e.picture();if(!d)return;let p=URL.createObjectURL(d);f("a",{href:p,download:`${n.header.title}.png`}).click(),URL.revokeObjectURL(p)}),[...l,f("div",{className:"buttons"},h,u)]}function Ge(n){let e={axis:-1,place:0,isFlipped:!1},t=X(-.5,.5,0,a=>r({place:a})),o=K(!1,a=>r({isFlipped:a})),r=a=>{Object.assign(e,a),t.disabled=o.disabled=e.axis<0;let s=e.isFlipped?1:-1,c=fe.map((l,h)=>h===e.axis?s:0);n.look.clip=e.axis<0?null:[c[0],c[1],c[2],-s*e.place],n.change()},i=$(["Nothing",...fe.map(a=>`Across ${a}`)],0,a=>r({axis:a-1}));return t.disabled=o.disabled=!0,[g("Cut away",i),g("Place",t),g("Other side",o)]}function qe(n,e){let{header:t}=n,o=f("p",{className:"drawn"},"…");e.onFinished=i=>{o.replaceChildren(...ze(i).flatMap(a=>[a,f("br")]))};let r=`${y(t.cells)} cells, ${y(t.vertices)} vertices`;return f("section",{className:"statistics"},f("p",{},r),o)}function ze({width:n,height:e,milliseconds:t,audit:o}){return[`${n} × ${e} pixels in ${y(t)} ms`,`${y(o.meanSteps)} cells a ray, at most ${y(o.mostSteps)}`,`${y(o.lost)} rays lost, ${y(o.bounded)} ended at ${y(Y)} cells`]}var pe=`* {
+  box-sizing: border-box;
+}
+html,
+body {
+  height: 100%;
+  margin: 0;
+  overflow: hidden;
+  font: 13px/1.45 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", sans-serif;
+  color: #e8eaed;
+}
+.picture {
+  position: fixed;
+  inset: 0;
+  width: 100%;
+  height: 100%;
+  display: block;
+  cursor: grab;
+  touch-action: none;
+  outline: none;
+}
+.picture.held {
+  cursor: grabbing;
+}
+.picture:focus-visible {
+  box-shadow: inset 0 0 0 2px #7cc4ff;
+}
+#poster {
+  z-index: 1;
+  pointer-events: none;
+  transition: opacity 0.25s;
+}
+#poster.gone {
+  opacity: 0;
+}
+.panel {
+  position: fixed;
+  z-index: 2;
+  top: 14px;
+  right: 14px;
+  width: 296px;
+  max-height: calc(100% - 28px);
+  display: flex;
+  flex-direction: column;
+  background: rgb(22 25 30 / 0.86);
+  backdrop-filter: blur(10px);
+  border: 1px solid rgb(255 255 255 / 0.1);
+  border-radius: 12px;
+  box-shadow: 0 8px 30px rgb(0 0 0 / 0.35);
+}
+.panel header {
+  display: flex;
+  align-items: center;
+  gap: 8px;
+  padding: 10px 10px 10px 16px;
+}
+h1 {
+  flex: 1;
+  margin: 0;
+  font-size: 14px;
+  font-weight: 600;
+  overflow: hidden;
+  text-overflow: ellipsis;
+  white-space: nowrap;
+}
+h2 {
+  margin: 0 0 8px;
+  font-size: 11px;
+  font-weight: 600;
+  letter-spacing: 0.06em;
+  text-transform: uppercase;
+  color: #9aa4b0;
+}
+.panel .body {
+  overflow-y: auto;
+}
+.panel.closed {
+  width: auto;
+  max-width: 60%;
+}
+.panel.closed .body {
+  display: none;
+}
+section {
+  padding: 12px 16px;
+  border-top: 1px solid rgb(255 255 255 / 0.08);
+}
+.row {
+  display: flex;
+  align-items: center;
+  gap: 10px;
+  min-height: 30px;
+}
+.row > span {
+  flex: 1;
+  white-space: nowrap;
+}
+input[type="range"] {
+  width: 150px;
+  margin: 0;
+  accent-color: #5aa9f0;
+}
+input[type="checkbox"] {
+  width: 16px;
+  height: 16px;
+  margin: 0;
+  accent-color: #5aa9f0;
+}
+input[type="color"] {
+  width: 44px;
+  height: 24px;
+  padding: 0;
+  border: 1px solid rgb(255 255 255 / 0.2);
+  border-radius: 6px;
+  background: none;
+  overflow: hidden;
+}
+input[type="color"]::-webkit-color-swatch-wrapper {
+  padding: 0;
+}
+input[type="color"]::-webkit-color-swatch {
+  border: 0;
+}
+:disabled {
+  opacity: 0.4;
+}
+select,
+button {
+  font: inherit;
+  color: inherit;
+  background: rgb(255 255 255 / 0.09);
+  border: 1px solid rgb(255 255 255 / 0.12);
+  border-radius: 7px;
+  padding: 4px 10px;
+}
+select {
+  width: 150px;
+}
+select option {
+  background: #22262d;
+}
+button {
+  cursor: pointer;
+}
+button:hover {
+  background: rgb(255 255 255 / 0.17);
+}
+.buttons {
+  display: flex;
+  gap: 8px;
+  margin-top: 8px;
+}
+.buttons button {
+  flex: 1;
+}
+.toggle {
+  width: 28px;
+  height: 26px;
+  padding: 0;
+  font-size: 16px;
+  line-height: 1;
+}
+.curve {
+  display: block;
+  width: 264px;
+  height: 132px;
+  border-radius: 8px;
+  background: rgb(0 0 0 / 0.35);
+  touch-action: none;
+}
+.ends {
+  display: flex;
+  justify-content: space-between;
+  margin: 3px 0 6px;
+  color: #9aa4b0;
+  font-variant-numeric: tabular-nums;
+}
+.hint,
+.statistics p {
+  margin: 0;
+  color: #9aa4b0;
+  font-size: 12px;
+}
+.failure {
+  position: fixed;
+  z-index: 3;
+  left: 50%;
+  bottom: 24px;
+  transform: translateX(-50%);
+  max-width: min(90%, 560px);
+  margin: 0;
+  padding: 12px 18px;
+  border-radius: 10px;
+  background: rgb(80 20 20 / 0.94);
+}
+`;async function me(n){let e=await $e(Xe(n.trim())),t=new DataView(e.buffer,e.byteOffset).getUint32(0,!0),o=JSON.parse(new TextDecoder().decode(e.subarray(4,4+t))),r=new Map,i=4+t;for(let l of o.arrays){r.set(l.name,{entry:l,of:u=>Ke(e,l,h,u)});let h=i;i+=l.rows*l.columns*l.width}let{cells:a,odd:s}=Ye(o,r.get("cells"),r.get("odd")),c=r.get("harmonics");return{header:o,positions:je(o,r.get("positions")),cells:a,odd:s,values:Qe(r),harmonics:c?Je(c):null}}function Xe(n){let e=Uint8Array.fromBase64;if(e)return e(n);let t=atob(n),o=new Uint8Array(t.length);for(let r=0;r<t.length;r++)o[r]=t.charCodeAt(r);return o}async function $e(n){let e=new Blob([n]).stream().pipeThrough(new DecompressionStream("deflate"));return new Uint8Array(await new Response(e).arrayBuffer())}function Ke(n,e,t,o){let{rows:r,width:i}=e,a=new Int32Array(r);for(let s=0;s<i;s++){let c=t+(o*i+s)*r;for(let l=0;l<r;l++)a[l]|=n[c+l]<<8*s}if(e.differences){let s=0;for(let c=0;c<r;c++){let l=a[c];s+=l&1?-((l>>>1)+1):l>>>1,a[c]=s}}return a}function je(n,e){let t=new Float32Array(3*n.vertices),o=2**e.entry.bits-1;for(let r=0;r<3;r++){let i=e.of(r),a=0;for(let s of i)a=Math.max(a,s);for(let s=0;s<i.length;s++)t[3*s+r]=(i[s]-.5*a)/o}return t}function Ye(n,e,t){let o=new Uint32Array(4*n.cells),r=[0,1,2,3].map(l=>e.of(l)),i=t.of(0),a=new Uint8Array(n.cells),s=0,c=0;for(let l=0;l<n.cells;l++){let h=r[0][l];s+=h,c=(h===0&&l>0?c:s)+r[1][l];let u=c+r[2][l];o.set([s,c,u,u+r[3][l]],4*l),a[l]=i[l>>3]>>(l&7)&1}return{cells:o,odd:a}}function Qe(n){let e=n.get("scalar");if(e){let a=new Float32Array(4*e.entry.rows),s=e.of(0);for(let c=0;c<s.length;c++)a[4*c+3]=e.entry.low+e.entry.step*s[c];return a}let t=n.get("density"),o=n.get("color"),r=new Float32Array(4*t.entry.rows),i=Ze();return[o.of(0),o.of(1),o.of(2),t.of(0)].forEach((a,s)=>{let c=(s<3?o:t).entry.dropped;for(let l=0;l<a.length;l++)r[4*l+s]=i[a[l]<<c]}),r}function Ze(){let n=new Float32Array(65536);for(let e=0;e<n.length;e++){let t=e>>10&31,o=e&1023,r=t===0?o*2**-24:(1024+o)*2**(t-25);n[e]=e&32768?-r:r}return n}function Je(n){let{rows:e,columns:t,scale:o,degree:r}=n.entry,i=new Float32Array(e*t);for(let a=0;a<t;a++){let s=n.of(a);for(let c=0;c<e;c++)i[c*t+a]=(s[c]-128)*o[a]}return{degree:r,coefficients:i}}var ge=40,et=50,tt=150,be=[1,.7,.5,.35,.25,.18,.125,.09],rt=4096,B=class{constructor(e,t,o,r){this.gl=e;this.renderer=t;this.orbit=o;this.look=r;this.quality=1;this.onFinished=()=>{};this.onFirst=()=>{};this.scale=3;this.coarse=null;this.fine=null;this.pending=null;this.isDirty=!0;this.changed=0;this.rows=0;this.bandRows=32;this.spent=0;this.isScheduled=!1;this.wasShown=!1;new ResizeObserver(()=>this.change()).observe(e.canvas)}change(){this.isDirty=!0,this.rows=0,this.spent=0,this.changed=performance.now(),this.schedule()}async picture(){if(!this.fine||this.rows<this.fine.height)return null;let{width:e,height:t}=this.fine,o=document.createElement("canvas");[o.width,o.height]=[e,t];let r=new ImageData(new Uint8ClampedArray(this.fine.pixels()),e,t);return o.getContext("2d").putImageData(r,0,0),new Promise(i=>o.toBlob(i))}schedule(){this.isScheduled||(this.isScheduled=!0,requestAnimationFrame(()=>{this.isScheduled=!1,this.advance()}))}advance(){let{gl:e}=this;if(e.isContextLost())return;if(this.pending){if(e.getSyncParameter(this.pending.sync,e.SYNC_STATUS)!==e.SIGNALED)return this.schedule();e.deleteSync(this.pending.sync);let{then:o,since:r}=this.pending;this.pending=null,o(performance.now()-r)}let t=e.canvas;!t.clientWidth||!t.clientHeight||(this.isDirty?(this.isDirty=!1,this.drawCoarse(t),this.schedule()):performance.now()-this.changed<tt?this.schedule():(!this.fine||this.rows<this.fine.height)&&(this.drawBand(t),this.schedule()))}drawCoarse(e){let[t,o]=ye(e,1);(e.width!==t||e.height!==o)&&([e.width,e.height]=[t,o]);let r=this.view(e,be[this.scale]);this.coarse=this.fitting(this.coarse,r);let i=this.coarse;this.renderer.draw(i,r,this.look),this.renderer.present(i),this.after(a=>{a>1.5*ge&&(this.scale=Math.min(this.scale+1,be.length-1)),a<.4*ge&&(this.scale=Math.max(this.scale-1,0)),this.wasShown||(this.wasShown=!0,this.onFirst())})}drawBand(e){let t=this.view(e,this.quality);this.fine=this.fitting(this.fine,t);let o=this.fine,r=Math.min(this.rows+this.bandRows,t.height);this.renderer.draw(o,t,this.look,this.rows,r),this.rows=r,this.after(i=>{this.spent+=i;let a=Math.min(Math.max(et/Math.max(i,1),.5),2);if(this.bandRows=Math.min(Math.max(Math.round(this.bandRows*a),4),4096),this.isDirty||this.rows<t.height)return;this.renderer.present(o);let{width:s,height:c}=o;this.onFinished({width:s,height:c,milliseconds:this.spent,audit:o.audit()})})}view(e,t){return this.orbit.view(...ye(e,t))}fitting(e,t){return e&&e.width===t.width&&e.height===t.height?e:(e?.delete(),new S(this.gl,t.width,t.height))}after(e){let t=this.gl.fenceSync(this.gl.SYNC_GPU_COMMANDS_COMPLETE,0);this.gl.flush(),this.pending={sync:t,since:performance.now(),then:e}}};function ye(n,e){let t=Math.min(e*window.devicePixelRatio,rt/Math.max(n.clientWidth,n.clientHeight));return[Math.max(1,Math.round(n.clientWidth*t)),Math.max(1,Math.round(n.clientHeight*t))]}var C=(n,e)=>n[0]*e[0]+n[1]*e[1]+n[2]*e[2],b=(n,e,t=1)=>[n[0]+t*e[0],n[1]+t*e[1],n[2]+t*e[2]],E=(n,e)=>[e*n[0],e*n[1],e*n[2]],G=(n,e)=>[n[1]*e[2]-n[2]*e[1],n[2]*e[0]-n[0]*e[2],n[0]*e[1]-n[1]*e[0]],O=n=>E(n,1/(Math.hypot(...n)||1));function xe(n,e,t){let[o,r]=[Math.cos(t),Math.sin(t)];return b(b(E(n,o),G(e,n),r),e,C(e,n)*(1-o))}var nt=Math.cos(3*Math.PI/180),q=class{constructor(e){this.opening=e;this.target=[0,0,0];this.up=[0,0,1];this.offset=[0,-1,0];this.fov=.9;this.reset()}reset(){this.target=this.opening.target,this.up=O(this.opening.up),this.offset=b(this.opening.eye,this.opening.target,-1),this.fov=this.opening.fov*Math.PI/180}turn(e,t){let o=xe(this.offset,this.up,-e),r=O(G(this.up,o)),i=xe(o,r,-t),a=Math.abs(C(i,this.up))/Math.hypot(...i);(a<nt||a<Math.abs(C(o,this.up))/Math.hypot(...o))&&(o=i),this.offset=o}zoom(e){let t=Math.hypot(...this.offset)*e;this.offset=E(O(this.offset),Math.min(Math.max(t,.02),50))}pan(e,t){let o=2*Math.hypot(...this.offset)*Math.tan(this.fov/2),r=this.view(1,1);this.target=b(b(this.target,r.right,-e*o),r.down,-t*o)}view(e,t){let o=O(E(this.offset,-1)),r=O(G(o,this.up)),i=.5*Math.min(e,t)/Math.tan(this.fov/2);return{eye:b(this.target,this.offset),right:r,down:G(o,r),forward:o,lens:[i,i,e/2,t/2],width:e,height:t}}};async function ot(){document.head.append(f("style",{textContent:pe}));let n=f("canvas",{className:"picture",tabIndex:0});n.setAttribute("aria-label","The volume; drag to turn it");let e=n.getContext("webgl2",{antialias:!1,alpha:!1,depth:!1});if(!e)throw new Error("This browser has no WebGL 2, or it is switched off; this picture is all it can show.");let t=await me(document.getElementById("volume").textContent),{header:o}=t,r=new H(e,t),i=new q(o.opening),a={background:o.background,clip:null,density:1,directional:!0},s=new B(e,r,i,a);s.onFirst=()=>document.getElementById("poster")?.classList.add("gone"),n.addEventListener("webglcontextlost",()=>{ve(new Error("The graphics driver has given up on this page; load it again, with another quality."))}),J(n,i,()=>s.change()),document.body.append(n,ue(t,r,s,i)),window.difftetvr={header:o,render:c=>it(e,r,t,a,c)},s.change()}function it(n,e,{header:t},o,r){let{center:i,size:a}=t.box,[s,c,l]=r.worldToCamera.slice(0,3).map(W=>W.slice(0,3)),h=r.worldToCamera.slice(0,3).map(W=>W[3]),u=b(b(E(s,-h[0]),c,-h[1]),l,-h[2]),{width:d,height:p,fx:x,fy:I,cx:U,cy:T}=r,k={eye:E(b(u,i,-1),1/a),right:s,down:c,forward:l,lens:[x,I,U,T],width:d,height:p},z=r.clip,Z=z?.slice(0,3),we=z&&[...E(Z,a),C(Z,i)+z[3]],N=new S(n,d,p);e.draw(N,k,{...o,background:r.background??o.background,clip:we??null});let Ee={pixels:at(N.pixels()),audit:N.audit()};return N.delete(),Ee}function at(n){let e=[];for(let t=0;t<n.length;t+=32768)e.push(String.fromCharCode(...n.subarray(t,t+32768)));return btoa(e.join(""))}function ve(n){let e=n instanceof Error?n.message:String(n);document.getElementById("poster")?.classList.remove("gone"),document.body.append(f("p",{className:"failure"},e))}ot().catch(ve);})();
