@@ -8,6 +8,9 @@ import type { Orbit } from "./view";
 
 const QUALITIES = [0.5, 1, 2];
 const AXES = ["x", "y", "z"];
+// Of the window, where the panel stands beside the picture; the same as in document.py.
+const WIDE = 700;
+const COVERED = 324;
 
 export function panelOf(volume: Volume, renderer: Renderer, stage: Stage, orbit: Orbit): HTMLElement {
   const { header } = volume;
@@ -28,9 +31,11 @@ export function panelOf(volume: Volume, renderer: Renderer, stage: Stage, orbit:
     panel.classList.toggle("closed", !isOpen);
     toggle.textContent = isOpen ? "\u2212" : "+";
     toggle.setAttribute("aria-expanded", String(isOpen));
+    stage.covered = isOpen && window.innerWidth >= WIDE ? COVERED : 0;
+    stage.change();
   };
   toggle.addEventListener("click", () => show(panel.classList.contains("closed")));
-  show(window.innerWidth >= 700);
+  show(window.innerWidth >= WIDE);
   return panel;
 }
 

@@ -26,6 +26,8 @@ interface Pending {
 export class Stage {
   /** Pixels of the fine picture for one of the screen's. */
   quality = 1;
+  /** Pixels of the window on the right that the panel covers. */
+  covered = 0;
   onFinished: (finished: Finished) => void = () => {};
   onFirst: () => void = () => {};
   private scale = 3;
@@ -139,7 +141,8 @@ export class Stage {
   }
 
   private view(canvas: HTMLCanvasElement, scale: number): View {
-    return this.orbit.view(...sizeOf(canvas, scale));
+    const [width, height] = sizeOf(canvas, scale);
+    return this.orbit.view(width, height, (this.covered * width) / canvas.clientWidth);
   }
 
   private fitting(target: Target | null, view: View): Target {

@@ -37,11 +37,14 @@ _DOCUMENT = """<!doctype html>
 <meta http-equiv="Content-Security-Policy" content="{policy}">
 <meta name="generator" content="DiffTetVR for Python {version}">
 <title>{title}</title>
-<style>#poster {{ position: fixed; inset: 0; width: 100%; height: 100%; object-fit: contain }}</style>
+<style>
+#poster {{ position: fixed; top: 0; left: 0; width: 100%; height: 100%; object-fit: contain }}
+@media (min-width: 700px) {{ #poster {{ width: calc(100% - 324px) }} }}
+</style>
 </head>
 <body>
 <img id="poster" alt="{title}" src="data:image/jpeg;base64,{poster}">
-<noscript>The volume can be turned and looked into where JavaScript is switched on.</noscript>
+<noscript>This page shows a volume, to be turned and looked into, where JavaScript is switched on.</noscript>
 <script id="volume" type="text/plain">{volume}</script>
 <script>{script}</script>
 </body>
