@@ -19,7 +19,7 @@ await build({
   entryPoints: ["src/main.ts"],
   bundle: true,
   minify: true,
-  charset: "utf8",
+  charset: "ascii",
   format: "iife",
   target: "es2020",
   legalComments: "none",

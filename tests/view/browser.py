@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import os
+import select
 import shutil
 import subprocess
 import tempfile
@@ -19,6 +20,9 @@ _OPTIONS = [
     *("--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
     *("--remote-debugging-pipe", "--no-first-run", "--disable-extensions", "--hide-scrollbars", "--mute-audio"),
 ]
+
+
+_LONGEST_WAIT = 60  # seconds
 
 
 class Browser:
@@ -96,9 +100,10 @@ class Browser:
         return found["result"].get("value")
 
     def wait_for(self, condition: str) -> None:
-        """Waits until an expression is true, looking at each frame."""
-        test = f"new Promise(done => {{ const look = () => ({condition}) ? done() : setTimeout(look, 30); look(); }})"
-        self.run(test)
+        """Waits until an expression is true."""
+        look = f"const look = () => ({condition}) ? done() : setTimeout(look, 30); look();"
+        give_up = f"setTimeout(() => fail(Error('waited in vain')), {1000 * _LONGEST_WAIT});"
+        self.run(f"new Promise((done, fail) => {{ {look} {give_up} }})")
 
     def mouse(self, kind: str, x: float, y: float, **parameters: Any) -> None:
         self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, **parameters)
@@ -116,8 +121,9 @@ class Browser:
 
     def _next(self) -> dict[str, Any]:
         while b"\0" not in self._buffer:
-            received = os.read(self._from, 1 << 20)
-            assert received, "the browser has ended"
+            is_there = select.select([self._from], [], [], 2 * _LONGEST_WAIT)[0]
+            received = os.read(self._from, 1 << 20) if is_there else b""
+            assert received, "the browser has ended, or says nothing any more"
             self._buffer += received
         message, _, self._buffer = self._buffer.partition(b"\0")
         return json.loads(message)

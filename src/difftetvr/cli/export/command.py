@@ -26,14 +26,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Export:
-    """Write a mesh with its data in another format, what it holds on a grid, the surface of a level, or a page to send."""
+    """Write a mesh in another format, what it holds on a regular grid, the surface of a level, or a page to send."""
 
     model: Annotated[Path, Positional, arg(metavar="MODEL")]
     """Mesh, in any format that is read."""
     output: Annotated[Path, Positional, arg(metavar="OUT")]
     """File to write. A mesh: .vtu, .vtk, .msh, .xdmf, .npz, .bintet, .ovm, .node with its .ele, or .mesh with
-    --geometry. A grid: .nrrd, .vti, .nii or .npy. A surface: .ply, .glb, .vtp, .obj or .stl. A page that shows the volume
-    in a browser: .html."""
+    --geometry. A grid: .nrrd, .vti, .nii or .npy. A surface: .ply, .glb, .vtp, .obj or .stl. A page for
+    browsers: .html."""
     geometry: bool = False
     """Leave out color, density and all other data."""
     without_harmonics: bool = False
