@@ -154,8 +154,15 @@ def test_what_hands_do(browser, tmp_path):
     knot = (box["right"] - 9, box["bottom"] - 9 - 0.7**0.5 * (box["height"] - 18))
     assert changed_by(browser, lambda: browser.drag(knot, (knot[0], box["bottom"] - 10)))
     assert changed_by(browser, lambda: browser.run(choosing(1, 1)))
-    reset = "document.querySelectorAll('.buttons button')[0].click()"
+    reset, save = (f"document.querySelectorAll('.buttons button')[{k}].click()" for k in (0, 1))
     assert changed_by(browser, lambda: browser.run(reset))
+    browser.run("URL.createObjectURL = blob => { window.saved = blob; return '' }")
+    browser.run("HTMLAnchorElement.prototype.click = () => {}")
+    browser.run(save)
+    browser.wait_for("window.saved")
+    size = "createImageBitmap(saved).then(image => [saved.type, image.width, image.height])"
+    # Without what the panel covers, in the quality Fast.
+    assert browser.run(size) == ["image/png", round((480 - 324) / 2), 150]
     browser.resize(720, 480)
 
 

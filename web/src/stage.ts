@@ -41,6 +41,7 @@ export class Stage {
   private spent = 0;
   private isScheduled = false;
   private wasShown = false;
+  private waiting: (() => void)[] = []; // for the fine picture
 
   constructor(
     private readonly gl: WebGL2RenderingContext,
@@ -60,13 +61,16 @@ export class Stage {
     this.schedule();
   }
 
-  /** The fine picture as PNG, or null while there is none. */
+  /** The fine picture as PNG, without what the panel covers, as soon as there is one. */
   async picture(): Promise<Blob | null> {
-    if (!this.fine || this.rows < this.fine.height) return null;
-    const { width, height } = this.fine;
+    if (!this.fine || this.rows < this.fine.height || this.pending) {
+      await new Promise<void>((resolve) => this.waiting.push(resolve));
+    }
+    const { width, height } = this.fine!;
     const canvas = document.createElement("canvas");
-    [canvas.width, canvas.height] = [width, height];
-    const data = new ImageData(new Uint8ClampedArray(this.fine.pixels()), width, height);
+    const free = 1 - this.covered / (this.gl.canvas as HTMLCanvasElement).clientWidth;
+    [canvas.width, canvas.height] = [Math.max(Math.round(free * width), 1), height];
+    const data = new ImageData(new Uint8ClampedArray(this.fine!.pixels()), width, height);
     canvas.getContext("2d")!.putImageData(data, 0, 0);
     return new Promise((resolve) => canvas.toBlob(resolve));
   }
@@ -137,6 +141,7 @@ export class Stage {
       this.renderer.present(target);
       const { width, height } = target;
       this.onFinished({ width, height, milliseconds: this.spent, audit: target.audit() });
+      for (const resolve of this.waiting.splice(0)) resolve();
     });
   }
 
