@@ -23,7 +23,7 @@ export interface Audit {
   /** Of one ray at most. */
   mostSteps: number;
   meanSteps: number;
-  /** Rays for which no face of a cell was found to leave through; they go on at the next entry. */
+  /** Rays for which no face of a cell was found to leave through; they went on through the nearest one. */
   lost: number;
   /** Rays that ended at the bound of steps. */
   bounded: number;

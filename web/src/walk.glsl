@@ -25,7 +25,7 @@ uniform float densityScale;
 uniform int mostSteps;
 
 layout(location = 0) out vec4 pixel;
-layout(location = 1) out uint audit;  // steps; bit 24: the ray was lost; bit 25: it ran out of steps
+layout(location = 1) out uint audit;  // steps; bit 24: the ray lost its way; bit 25: it ran out of steps
 
 const uint NONE = 0xffffffffu;
 const float INFINITE = 1e30;
@@ -201,31 +201,32 @@ bool walk(Ray ray, Span span, int entry, inout Light light, inout uint steps) {
   uint cell = texelFetch(faces, place(uint(2 * entry + 1)), 0).x;
   float t0 = distanceTo(face);
   vec4 v0 = interpolated(face);
-  for (;; steps++) {
-    if ((steps & 0xffffffu) >= uint(mostSteps)) {
-      steps |= 1u << 25;
-      return false;
-    }
+  for (; (steps & 0xffffffu) < uint(mostSteps); steps++) {
     Corner c = cornerAt(ray, apex);
     vec3 to = vec3(edgeOf(face.p.offset, c.offset), edgeOf(face.q.offset, c.offset), edgeOf(face.r.offset, c.offset));
     bool leftP = isLeft(to.x, face.p, c), leftQ = isLeft(to.y, face.q, c), leftR = isLeft(to.z, face.r, c);
     // The apex takes the place of one corner: of the one that lies between a left and a right edge.
+    bool dropsP = leftR && !leftQ, dropsQ = leftP && !leftR, dropsR = leftQ && !leftP;
+    if (!dropsP && !dropsQ && !dropsR) {
+      // A compiler has rounded one vertex in two ways, and the ray runs next to it: then to what is least wrong.
+      steps |= 1u << 24;
+      vec3 wrong = max(-to.zxy, to.yzx);
+      dropsP = wrong.x <= min(wrong.y, wrong.z);
+      dropsQ = !dropsP && wrong.y <= wrong.z;
+    }
     uint dropped;
-    if (leftR && !leftQ) {
+    if (dropsP) {
       dropped = face.p.vertex;
       face.edges = vec3(face.edges.x, to.z, -to.y);
       face.p = c;
-    } else if (leftP && !leftR) {
+    } else if (dropsQ) {
       dropped = face.q.vertex;
       face.edges = vec3(-to.z, face.edges.y, to.x);
       face.q = c;
-    } else if (leftQ && !leftP) {
+    } else {
       dropped = face.r.vertex;
       face.edges = vec3(to.y, -to.x, face.edges.z);
       face.r = c;
-    } else {
-      steps |= 1u << 24;
-      return true;
     }
     float t1 = distanceTo(face);
 #ifdef CELLS
@@ -248,6 +249,8 @@ bool walk(Ray ray, Span span, int entry, inout Light light, inout uint steps) {
     t0 = t1;
     v0 = v1;
   }
+  steps |= 1u << 25;
+  return false;
 }
 
 void main() {
