@@ -24,7 +24,7 @@ await build({
   target: "es2020",
   legalComments: "none",
   loader: { ".css": "text", ".glsl": "text" },
-  banner: { js: `/* Built from web/src by 'npm run build'; sources ${hashOfSources()} */` },
+  banner: { js: `/* Built from web/src by 'make page'; sources ${hashOfSources()} */` },
   outfile: OUTPUT,
 });
 console.log(`Wrote ${OUTPUT}`);

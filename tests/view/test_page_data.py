@@ -222,7 +222,7 @@ def test_the_script_is_built_of_the_sources():
     for file in sorted(sources.iterdir()):
         digest.update(f"{file.name}\n".encode() + file.read_bytes())
     script = (ROOT / "src" / "difftetvr" / "view" / "page" / "page.js").read_text(encoding="utf-8")
-    assert f"sources {digest.hexdigest()} */" in script.splitlines()[0], "run `npm run build` in web/"
+    assert f"sources {digest.hexdigest()} */" in script.splitlines()[0], "run `make page`"
     assert "</script" not in script
 
 

@@ -8,7 +8,8 @@ import type { Orbit } from "./view";
 
 const QUALITIES = [0.5, 1, 2];
 const AXES = ["x", "y", "z"];
-// Of the window, where the panel stands beside the picture; the same as in document.py.
+// Pixels: of a window in which the panel stands beside the picture and not below, and that it covers there; the same as
+// in document.py.
 const WIDE = 700;
 const COVERED = 324;
 
@@ -31,9 +32,15 @@ export function panelOf(volume: Volume, renderer: Renderer, stage: Stage, orbit:
     panel.classList.toggle("closed", !isOpen);
     toggle.textContent = isOpen ? "\u2212" : "+";
     toggle.setAttribute("aria-expanded", String(isOpen));
-    stage.covered = isOpen && window.innerWidth >= WIDE ? COVERED : 0;
+    cover();
+  };
+  const cover = () => {
+    const isWide = window.innerWidth >= WIDE;
+    const isOpen = !panel.classList.contains("closed");
+    stage.covered = isOpen ? (isWide ? [COVERED / window.innerWidth, 0] : [0, 0.5]) : [0, 0];
     stage.change();
   };
+  window.addEventListener("resize", cover);
   toggle.addEventListener("click", () => show(panel.classList.contains("closed")));
   show(window.innerWidth >= WIDE);
   return panel;

@@ -26,8 +26,8 @@ interface Pending {
 export class Stage {
   /** Pixels of the fine picture for one of the screen's. */
   quality = 1;
-  /** Pixels of the window on the right that the panel covers. */
-  covered = 0;
+  /** Parts of the window's width, from the right, and of its height, from below, that the panel covers. */
+  covered: [number, number] = [0, 0];
   onFinished: (finished: Finished) => void = () => {};
   onFirst: () => void = () => {};
   private scale = 3;
@@ -68,8 +68,8 @@ export class Stage {
     }
     const { width, height } = this.fine!;
     const canvas = document.createElement("canvas");
-    const free = 1 - this.covered / (this.gl.canvas as HTMLCanvasElement).clientWidth;
-    [canvas.width, canvas.height] = [Math.max(Math.round(free * width), 1), height];
+    canvas.width = Math.max(Math.round((1 - this.covered[0]) * width), 1);
+    canvas.height = Math.max(Math.round((1 - this.covered[1]) * height), 1);
     const data = new ImageData(new Uint8ClampedArray(this.fine!.pixels()), width, height);
     canvas.getContext("2d")!.putImageData(data, 0, 0);
     return new Promise((resolve) => canvas.toBlob(resolve));
@@ -118,7 +118,8 @@ export class Stage {
     this.renderer.present(target);
     this.after((milliseconds) => {
       if (milliseconds > 1.5 * COARSE_GOAL) this.scale = Math.min(this.scale + 1, SCALES.length - 1);
-      if (milliseconds < 0.4 * COARSE_GOAL) this.scale = Math.max(this.scale - 1, 0);
+      // Looked at once a frame, so no time is less than one of these.
+      if (milliseconds < 0.55 * COARSE_GOAL) this.scale = Math.max(this.scale - 1, 0);
       if (!this.wasShown) {
         this.wasShown = true;
         this.onFirst();
@@ -147,7 +148,7 @@ export class Stage {
 
   private view(canvas: HTMLCanvasElement, scale: number): View {
     const [width, height] = sizeOf(canvas, scale);
-    return this.orbit.view(width, height, (this.covered * width) / canvas.clientWidth);
+    return this.orbit.view(width, height, this.covered[0] * width, this.covered[1] * height);
   }
 
   private fitting(target: Target | null, view: View): Target {

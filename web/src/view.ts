@@ -75,18 +75,18 @@ export class Orbit {
     this.target = add(add(this.target, view.right, -across * size), view.down, -down * size);
   }
 
-  /** The view in a picture of some size, of which the last columns are covered. */
-  view(width: number, height: number, covered = 0): View {
-    const free = Math.max(width - covered, 1);
+  /** The view in a picture of some size, of which columns on the right and rows at the bottom are covered. */
+  view(width: number, height: number, columns = 0, rows = 0): View {
+    const free = [Math.max(width - columns, 1), Math.max(height - rows, 1)];
     const forward = normalised(scaled(this.offset, -1));
     const right = normalised(cross(forward, this.up));
-    const focal = (0.5 * Math.min(free, height)) / Math.tan(this.fov / 2);
+    const focal = (0.5 * Math.min(...free)) / Math.tan(this.fov / 2);
     return {
       eye: add(this.target, this.offset),
       right,
       down: cross(forward, right),
       forward,
-      lens: [focal, focal, free / 2, height / 2],
+      lens: [focal, focal, free[0] / 2, free[1] / 2],
       width,
       height,
     };
