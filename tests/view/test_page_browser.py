@@ -115,6 +115,21 @@ def test_rays_along_edges_and_through_vertices(browser, tmp_path):
     require_alike(browser, mesh, field, cameras)
 
 
+def test_cells_that_rounding_turns_inside_out(browser, tmp_path):
+    """A layer as thin as no float of the page tells."""
+    mesh = TetMesh.grid((5, 5, 3)).to(dtype=torch.float64)
+    x, y, layer = mesh.vertices.unbind(1)
+    z = torch.tensor([0.0, 0.5, 0.5 + 1e-9, 1.0], dtype=torch.float64)[(3 * layer).round().long()]
+    turn = torch.linalg.qr(torch.tensor([[1.0, 0.3, 0.2], [0.1, 1.0, 0.4], [0.3, 0.2, 1.0]]).double())[0]
+    turn = turn * torch.linalg.det(turn)
+    mesh = mesh.with_vertices(torch.stack((x, y, z), dim=1) @ turn.T + torch.tensor([4.0, 0.0, 5.5]))
+    field = Field(torch.rand(mesh.num_vertices, 3), 3.0 * torch.rand(mesh.num_vertices))
+    page = dtv.view.save_page(tmp_path / "a.html", mesh, field)
+    assert page.inverted > 5 and float(mesh.volumes().min()) > 0.0
+    browser.open(tmp_path / "a.html")
+    require_alike(browser, mesh, field, CAMERAS[:2])
+
+
 def changed_by(browser, action) -> bool:
     """Whether a settled picture is another after something was done and it has settled again."""
     browser.wait_for(SETTLED)
@@ -136,6 +151,8 @@ def test_what_hands_do(browser, tmp_path):
     field = ScalarField(mesh.vertices[:, 0], TransferFunction.default())
     opened(browser, tmp_path, mesh, field, title="A & B", scalar="height")
     assert browser.run("document.querySelector('h1').textContent") == "A & B"
+    browser.wait_for(SETTLED)
+    browser.run("document.querySelector('.drawn').textContent = ''")
     browser.resize(700, 300)  # a small picture is a quick one; any narrower, and the panel would be below it
     browser.run(choosing(0, 0))
     assert changed_by(browser, lambda: browser.drag((60, 200), (90, 180)))
