@@ -1,5 +1,5 @@
 // The panel beside the picture.
-import { choice, colorInput, grouped, make, row, slider, tick } from "./elements";
+import { choice, colorInput, grouped, make, row, short, slider, tick } from "./elements";
 import type { Volume } from "./payload";
 import { type Renderer, STEP_BOUND } from "./renderer";
 import type { Finished, Stage } from "./stage";
@@ -23,7 +23,7 @@ export function panelOf(volume: Volume, renderer: Renderer, stage: Stage, orbit:
     });
     body.append(section(header.scalar ?? "Scalar", editor.element));
   }
-  body.append(section("Picture", ...pictureRows(volume, stage, orbit)), section("Cut", ...cutRows(stage)));
+  body.append(section("Picture", ...pictureRows(volume, stage, orbit)), section("Cut", ...cutRows(volume, stage)));
   body.append(statistics(volume, stage));
   const toggle = make("button", { type: "button", className: "toggle", title: "Show or hide the panel" });
   const title = make("h1", {}, header.title);
@@ -87,21 +87,23 @@ function pictureRows(volume: Volume, stage: Stage, orbit: Orbit): HTMLElement[] 
   return [...rows, make("div", { className: "buttons" }, reset, save)];
 }
 
-function cutRows(stage: Stage): HTMLElement[] {
+function cutRows({ header: { box } }: Volume, stage: Stage): HTMLElement[] {
   const state = { axis: -1, place: 0, isFlipped: false };
   const place = slider(-0.5, 0.5, 0, (value) => update({ place: value }));
+  const where = make("output", { className: "where" });
   const flip = tick(false, (isFlipped) => update({ isFlipped }));
   const update = (change: Partial<typeof state>) => {
     Object.assign(state, change);
     place.disabled = flip.disabled = state.axis < 0;
     const sign = state.isFlipped ? 1 : -1;
     const normal = AXES.map((_, axis) => (axis === state.axis ? sign : 0));
+    where.textContent = state.axis < 0 ? "" : short(box.center[state.axis] + box.size * state.place);
     stage.look.clip = state.axis < 0 ? null : [normal[0], normal[1], normal[2], -sign * state.place];
     stage.change();
   };
   const axis = choice(["Nothing", ...AXES.map((name) => `Across ${name}`)], 0, (index) => update({ axis: index - 1 }));
   place.disabled = flip.disabled = true;
-  return [row("Cut away", axis), row("Place", place), row("Other side", flip)];
+  return [row("Cut away", axis), row("Place", where, place), row("Other side", flip)];
 }
 
 function statistics(volume: Volume, stage: Stage): HTMLElement {

@@ -40,15 +40,14 @@ class PageOptions:
             MeshError: The mesh or its data cannot be shown in a page.
         """
         from difftetvr.rendering.cameras.camera_file import load_camera
-        from difftetvr.view.page import PageOptions as Opening
-        from difftetvr.view.page import save_page
+        from difftetvr.view import page as pages
 
         background = color_of(self.background)
         camera = None if self.camera is None else load_camera(self.camera)
         shown = self._shown(job)
-        opening = Opening(self._title(job.model), background, camera, shown.name)
+        options = pages.PageOptions(self._title(job.model), background, camera, shown.name)
         with job.naming_model(), waiting(job.console, f"Writing {job.output}"):
-            page = save_page(job.output, shown.mesh, shown.field, opening)
+            page = pages.save_page(job.output, shown.mesh, shown.field, options)
         if shown.note is not None:
             job.say(shown.note)
         if job.data.defects.doubled_places > 0:
