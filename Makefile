@@ -9,7 +9,7 @@ FUZZ_SECONDS ?= 3600
 # Tests run in one process for each core, up to four: each loads PyTorch and compiles kernels of its own.
 PYTEST := $(BIN)/python -m pytest -q --durations=10 -n auto --maxprocesses=4 --dist worksteal
 
-.PHONY: help setup demo test test-all test-cuda-emulated fuzz lint bench docs clean distclean
+.PHONY: help setup demo test test-all test-cuda-emulated fuzz lint bench docs page clean distclean
 
 help:
 	@echo 'make demo       reconstruct the Tooth CT scan from rendered views; pictures in out/demo'
@@ -20,8 +20,9 @@ help:
 	@echo 'make lint       lint and types only'
 	@echo 'make bench      print the tables of docs/results.md'
 	@echo 'make docs       build the manual; begins at docs/_build/html/index.html'
+	@echo 'make page       build the script of pages that show volumes in a browser, after changes in web/; needs Node'
 	@echo 'make setup      only set up .venv and libLLVM (the others do it too)'
-	@echo 'make clean      remove caches, builds and out/;  make distclean  .venv too'
+	@echo 'make clean      remove caches, builds and out/;  make distclean  .venv and web/node_modules, too'
 
 setup:
 	@sh scripts/setup.sh
@@ -62,9 +63,12 @@ docs:
 	$(BIN)/python -m sphinx -W --keep-going -n -q -b html -d docs/_build/doctrees docs docs/_build/html
 	@echo 'docs/_build/html/index.html is the first page.'
 
+page:
+	cd web && npm ci --no-audit --no-fund && npm run build
+
 clean:
 	rm -rf docs/_build docs/gallery out build dist .pytest_cache .hypothesis .mypy_cache .ruff_cache
 	find src tests examples benchmarks scripts tools -name __pycache__ -type d -prune -exec rm -rf {} +
 
 distclean: clean
-	rm -rf .venv
+	rm -rf .venv web/node_modules

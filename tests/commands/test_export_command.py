@@ -305,7 +305,7 @@ def test_fields_on_cells(tmp_path, capsys):
         (["g.nrrd", "--level", "1"], "--level is for a surface (.ply, .glb, .vtp, .obj, .stl), which "),
         (["g.ply", "--samples", "2"], "--samples is for a grid (.nrrd, .vti, .nii, .npy), which "),
         (["g.vtu", "--outside", "nan"], "--outside is for a grid"),
-        (["g.vtu", "--scalar", "T"], "--scalar is for a grid or a surface"),
+        (["g.vtu", "--scalar", "T"], "--scalar is for a grid, a surface or a page"),
         (["g.vti", "--geometry"], "--geometry is for a mesh"),
         (["g.stl", "--without-harmonics"], "--without-harmonics is for a mesh"),
         (["nowhere/g.ply"], "create the folder first"),

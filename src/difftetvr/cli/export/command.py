@@ -12,6 +12,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from difftetvr.cli.arguments import Groups
 from difftetvr.cli.export.grids import GridOptions
 from difftetvr.cli.export.job import Job
+from difftetvr.cli.export.pages import PageOptions
 from difftetvr.cli.export.surfaces import SurfaceOptions
 from difftetvr.cli.options import TRUST_GROUPS, MeshOptions, TrustOptions
 from difftetvr.errors import MeshError, counted, listed
@@ -25,29 +26,33 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Export:
-    """Write a mesh with its data in another format, what it holds on a regular grid, or the surface of a level."""
+    """Write a mesh in another format, what it holds on a regular grid, the surface of a level, or a page to send."""
 
     model: Annotated[Path, Positional, arg(metavar="MODEL")]
     """Mesh, in any format that is read."""
     output: Annotated[Path, Positional, arg(metavar="OUT")]
     """File to write. A mesh: .vtu, .vtk, .msh, .xdmf, .npz, .bintet, .ovm, .node with its .ele, or .mesh with
-    --geometry. A grid: .nrrd, .vti, .nii or .npy. A surface: .ply, .glb, .vtp, .obj or .stl."""
+    --geometry. A grid: .nrrd, .vti, .nii or .npy. A surface: .ply, .glb, .vtp, .obj or .stl. A page for
+    browsers: .html."""
     geometry: bool = False
     """Leave out color, density and all other data."""
     without_harmonics: bool = False
     """Leave out what colours owe to the direction, which only .vtu and .npz can hold."""
     scalar: tuple[str, ...] = ()
-    """Name of the point or cell data to sample, or whose surface to take, with a component if wanted (velocity:x); for
-    .vti one or more; default: density, in .vti density and color or all data, or the only data there are."""
+    """Name of the point or cell data to sample, to show, or whose surface to take, with a component if wanted
+    (velocity:x); for .vti one or more; default: density, in .vti density and color or all data, or the only data there
+    are; for a page color and density."""
     grid: OmitArgPrefixes[GridOptions] = field(default_factory=GridOptions)
     surface: OmitArgPrefixes[SurfaceOptions] = field(default_factory=SurfaceOptions)
+    page: OmitArgPrefixes[PageOptions] = field(default_factory=PageOptions)
     reading: OmitArgPrefixes[MeshOptions] = field(default_factory=MeshOptions)
     trust: OmitArgPrefixes[TrustOptions] = field(default_factory=TrustOptions)
     groups: ClassVar[Groups] = {
         "Meshes": ("geometry", "without-harmonics"),
-        "Grids and surfaces": ("scalar",),
+        "Grids, surfaces and pages": ("scalar",),
         "Grids": ("spacing", "size", "like", "fitted", "samples", "outside", "device"),
         "Surfaces": ("level", "colors"),
+        "Pages": ("transfer-function", "value-range", "attenuation", "background", "camera", "title"),
         "How MODEL is read": ("split", "step"),
         **TRUST_GROUPS,
     }
@@ -62,11 +67,13 @@ class Export:
             self.grid.write(job)
         elif kind == "surface":
             self.surface.write(job)
+        elif kind == "page":
+            self.page.write(job)
         else:
             self._write_mesh(data, console)
 
     def _kind(self) -> str:
-        """Whether a mesh, a grid or a surface is written.
+        """Whether a mesh, a grid, a surface or a page is written.
 
         Raises:
             MeshError: None of them, or an option is for another.
@@ -79,6 +86,7 @@ class Export:
             "mesh": (*WRITABLE_SUFFIXES, *GEOMETRY_SUFFIXES),
             "grid": GRID_SUFFIXES,
             "surface": SURFACE_SUFFIXES,
+            "page": (".html",),
         }
         suffix = self.output.suffix.lower()
         kind = next((kind for kind, suffixes in kinds.items() if suffix in suffixes), None)
@@ -86,9 +94,10 @@ class Export:
             known = ", or ".join(f"a {kind} ({', '.join(suffixes)})" for kind, suffixes in kinds.items())
             raise MeshError(f"{self.output}: '{self.output.suffix}' is no format that is written; write {known}.")
         of_mesh = {"geometry": self.geometry, "without_harmonics": self.without_harmonics}
-        given = {"mesh": of_mesh, "grid": _changed(self.grid), "surface": _changed(self.surface)}
+        others = {"grid": self.grid, "surface": self.surface, "page": self.page}
+        given = {"mesh": of_mesh, **{name: _changed(options) for name, options in others.items()}}
         if kind == "mesh" and self.scalar:
-            raise MeshError(f"--scalar is for a grid or a surface, which {self.output} is not; leave it out.")
+            raise MeshError(f"--scalar is for a grid, a surface or a page, which {self.output} is not; leave it out.")
         for other, options in given.items():
             name = next((name for name, is_given in options.items() if is_given), None)
             if other != kind and name is not None:
