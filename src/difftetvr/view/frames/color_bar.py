@@ -1,0 +1,100 @@
+"""Colour bars: which colour a scalar has where."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.ticker import LogLocator, MaxNLocator, ScalarFormatter
+
+from difftetvr.optics.transfer_function import TransferFunction
+from difftetvr.view.frames.lettering import Layer
+
+ROOM = 0.16
+"""Share of a picture's width, on its right, that a colour bar takes."""
+
+_LEFT, _WIDTH, _TOP, _BOTTOM = 1.0 - 0.88 * ROOM, 0.022, 0.22, 0.80
+_STEPS = 256
+_FEWEST_DECADES = 1.0  # from which on ticks are powers of ten
+
+
+@dataclass(frozen=True, eq=False)
+class ColorScale:
+    """Colours of a scalar.
+
+    Attributes:
+        label: What the scalar is called.
+        value_range: Values at its transfer function's 0 and 1.
+        transfer_function: Colours of scalars in units of the range.
+        is_log: Whether the bar is logarithmic, which takes a range above 0.
+    """
+
+    label: str
+    value_range: tuple[float, float]
+    transfer_function: TransferFunction
+    is_log: bool = False
+
+    def colors(self, count: int) -> torch.Tensor:
+        """(count, 3) colours along the bar, from its lower end."""
+        along = torch.linspace(0.0, 1.0, count, dtype=torch.float64)
+        low, high = self.value_range
+        if self.is_log:
+            ratio = math.log(high) - math.log(low)
+            along = torch.expm1(along * ratio) / math.expm1(ratio)
+        return self.transfer_function(along)[0].detach().clamp(0.0, 1.0)
+
+    def ticks(self) -> list[tuple[float, str]]:
+        """Where along the bar, from 0 to 1, numbers stand, and these."""
+        low, high = self.value_range
+        has_decades = self.is_log and math.log10(high) - math.log10(low) >= _FEWEST_DECADES
+        locator = LogLocator(numticks=8) if has_decades else MaxNLocator(6)
+        values = [float(value) for value in locator.tick_values(low, high) if low <= value <= high]
+        if has_decades:
+            labels = [f"$10^{{{round(math.log10(value))}}}$" for value in values]
+        else:
+            labels = labels_of(values, low, high)
+        return [(self._place(value), label) for value, label in zip(values, labels, strict=True)]
+
+    def _place(self, value: float) -> float:
+        low, high = self.value_range
+        if self.is_log:
+            return math.log(value / low) / math.log(high / low)
+        return (value - low) / (high - low)
+
+
+def labels_of(values: list[float], low: float, high: float) -> list[str]:
+    """Numbers of a scale as text, with as many digits as tell them apart."""
+    formatter = ScalarFormatter(useOffset=False)
+    formatter.create_dummy_axis()
+    axis: Any = formatter.axis
+    axis.set_view_interval(low, high)
+    axis.set_data_interval(low, high)
+    labels = formatter.format_ticks(values)
+    exponent = formatter.get_offset()
+    return [f"{label}{exponent.replace('1e', 'e')}" if exponent else label for label in labels]
+
+
+def draw_color_bar(layer: Layer, scale: ColorScale) -> None:
+    """Draws a colour bar on the right of a sheet.
+
+    Args:
+        layer: Where to.
+        scale: What it shows.
+    """
+    left, right = _LEFT * layer.width, (_LEFT + _WIDTH) * layer.width
+    top, bottom = _TOP * layer.height, _BOTTOM * layer.height
+    colors = scale.colors(_STEPS).numpy()[:, None]
+    layer.axes.imshow(
+        np.flip(colors, 0), extent=(left, right, bottom, top), aspect="auto", interpolation="bilinear", zorder=1
+    )
+    layer.axes.set(xlim=(0, layer.width), ylim=(layer.height, 0))  # which an image changes
+    layer.line([(left, top), (right, top), (right, bottom), (left, bottom), (left, top)])
+    for place, label in scale.ticks():
+        y = bottom + place * (top - bottom)
+        layer.line([(right, y), (right + 0.4 * layer.letters, y)])
+        layer.text((right + 0.7 * layer.letters, y), label, across="left")
+    # From the right edge of the picture, whatever its length.
+    layer.text((layer.width - 0.6 * layer.letters, top - layer.letters), scale.label, across="right", along="bottom")
