@@ -86,6 +86,12 @@ class CameraSet:
         return cameras[int(deviation.argmin())]
 
     @property
+    def inner_bounds(self) -> torch.Tensor:
+        """(2, 3) float64 corners of a cube around `focus` that reaches as far as half of the cameras stand away."""
+        distance = float(np.median(np.linalg.norm(self.positions - self.focus, axis=1)))
+        return torch.from_numpy(np.stack((self.focus - distance, self.focus + distance)))
+
+    @property
     def _horizon(self) -> tuple[Floats, Floats]:
         """Unit vectors across `up`; the world's x and y where up is z."""
         right = np.cross((0.0, 1.0, 0.0), self.up)

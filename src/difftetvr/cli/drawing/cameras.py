@@ -155,6 +155,11 @@ class Place:
         """The run whose model this is, as far as it is known."""
         return self._run
 
+    @property
+    def views(self) -> CameraSet | None:
+        """Cameras of the photographs that the model comes from; None where it comes from none, or they are gone."""
+        return self._known_views() if self.is_of_photographs else None
+
     def shots(self, bounds: torch.Tensor, room: tuple[float, float] = (0.0, 0.0)) -> Shots:
         """The cameras.
 

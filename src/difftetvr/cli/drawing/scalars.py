@@ -18,18 +18,22 @@ if TYPE_CHECKING:
     from difftetvr.rendering import ScalarField
     from difftetvr.view.frames import ColorScale
     from difftetvr.view.looks import Distribution, Look
+    from difftetvr.view.looks.opacities import OpacityPreset
+
+COLOR_GROUP = ("scalar", "transfer-function", "colormap", "value-range", "percentile", "log")
+"""Names of the options of colours below."""
 
 SCALAR_GROUP = (
     *("scalar", "transfer-function", "colormap", "opacity", "value-range", "percentile", "log", "attenuation"),
 )
-"""Names of the options below."""
+"""Names of all options below."""
 
 _ATTENUATION = 25.0  # of a transfer function from a file, as in the published experiments
 
 
 @dataclass(frozen=True)
-class ScalarOptions:
-    """What scalars look like, for meshes without color and density, where a scalar is named, and for volumes."""
+class ColorOptions:
+    """Which colours scalars have, for meshes without color and density, where a scalar is named, and for volumes."""
 
     scalar: str | None = None
     """Name of the point or cell data to show, with a component if wanted (velocity:x, stress:von-mises); default: color
@@ -38,18 +42,18 @@ class ScalarOptions:
     """Colour and opacity of the scalar, .json or .xml; default: what the following options say."""
     colormap: str | None = None
     """Name of a colour map of Matplotlib's or cmcrameri's, such as viridis, turbo or batlow; default: coolwarm."""
-    opacity: Literal["edges", "peak", "ramp", "flat"] | None = None
-    """Opaque is where the scalar changes, or only near some values, as surfaces; the more the greater it is; or
-    everything alike; default: edges."""
     value_range: tuple[float, float] | None = None
     """Scalars at the transfer function's 0 and 1; default: the least and the greatest, but for outliers."""
     percentile: tuple[float, float] | None = None
     """The same, as per cent of the volume with smaller scalars, such as 1 99."""
     log: bool = False
     """Spread the colours over the logarithm of the scalar."""
-    attenuation: float | None = None
-    """Density of opacity 1, where the mesh's longest side is 1; default: so that one sees through, with a transfer
-    function 25."""
+
+    def _opacity(self) -> OpacityPreset | None:
+        return None
+
+    def _attenuation(self) -> float | None:
+        return None
 
     def apply(self, data: MeshData, path: Path) -> Shown:
         """What to render of a file.
@@ -90,7 +94,7 @@ class ScalarOptions:
             scale = _scale(scalar, function, value_range or (low, high), None)
         else:
             look = self._look(self._distribution(scalar), value_range, scalar.name)
-            density = look.attenuation if self.attenuation is None else self.attenuation
+            density = self._density(look.attenuation)
             function = look.transfer_function
             field = ScalarField(scalar.values, function, density / longest, look.value_range, scalar.location)
             scale = _scale(scalar, function, look.value_range, look)
@@ -115,7 +119,7 @@ class ScalarOptions:
         self._require_valid()
         low, high = (float(end) for end in volume.value_range)
         if function is not None:
-            density = _ATTENUATION if self.attenuation is None else self.attenuation
+            density = self._density(_ATTENUATION)
             return ShownVolume(volume, function, density, ColorScale("value", (low, high), function))
         # In the values of the file, of which logarithms are to be taken.
         found = Distribution.of_volume(volume)
@@ -127,7 +131,7 @@ class ScalarOptions:
         start, end = ((value - low) / (high - low) for value in look.value_range)
         values = ((volume.values - start) / (end - start)).clip(0.0, 1.0).astype(np.float32)
         shown = replace(volume, values=values, value_range=look.value_range)
-        density = look.attenuation if self.attenuation is None else self.attenuation
+        density = self._density(look.attenuation)
         scale = ColorScale("value", look.value_range, look.transfer_function, look.is_log)
         return ShownVolume(shown, look.transfer_function, density, scale)
 
@@ -136,7 +140,7 @@ class ScalarOptions:
 
         usual = Appearance()
         appearance = Appearance(
-            self.colormap or usual.colormap, self.opacity or usual.opacity, value_range, self.percentile, self.log
+            self.colormap or usual.colormap, self._opacity() or usual.opacity, value_range, self.percentile, self.log
         )
         return appearance.look(distribution, name)
 
@@ -149,13 +153,15 @@ class ScalarOptions:
     def _loaded(self, path: Path) -> tuple[TransferFunction, float]:
         from difftetvr.optics.transfer_function import TransferFunction
 
-        return TransferFunction.load(path), _ATTENUATION if self.attenuation is None else self.attenuation
+        return TransferFunction.load(path), self._density(_ATTENUATION)
+
+    def _density(self, usual: float) -> float:
+        given = self._attenuation()
+        return usual if given is None else given
 
     def _require_valid(self) -> None:
-        if self.attenuation is not None and not (math.isfinite(self.attenuation) and self.attenuation >= 0):
-            raise MeshError(f"--attenuation is {self.attenuation:g}; it must be finite and not negative.")
         if self.transfer_function is not None:
-            other = {"colormap": self.colormap, "opacity": self.opacity, "percentile": self.percentile}
+            other = {"colormap": self.colormap, "opacity": self._opacity(), "percentile": self.percentile}
             given = [name for name, value in other.items() if value is not None] + ["log"] * self.log
             if given:
                 raise CaptureError(
@@ -168,6 +174,29 @@ class ScalarOptions:
                 raise MeshError(f"--percentile is {low:g} {high:g}; give two numbers from 0 to 100, the smaller first.")
             if self.value_range is not None:
                 raise MeshError("--value-range and --percentile both say where the colours end; leave out one of them.")
+
+
+@dataclass(frozen=True)
+class ScalarOptions(ColorOptions):
+    """What scalars look like: their colours, and how opaque they are."""
+
+    opacity: Literal["edges", "peak", "ramp", "flat"] | None = None
+    """Opaque is where the scalar changes, or only near some values, as surfaces; the more the greater it is; or
+    everything alike; default: edges."""
+    attenuation: float | None = None
+    """Density of opacity 1, where the mesh's longest side is 1; default: so that one sees through, with a transfer
+    function 25."""
+
+    def _opacity(self) -> OpacityPreset | None:
+        return self.opacity
+
+    def _attenuation(self) -> float | None:
+        return self.attenuation
+
+    def _require_valid(self) -> None:
+        if self.attenuation is not None and not (math.isfinite(self.attenuation) and self.attenuation >= 0):
+            raise MeshError(f"--attenuation is {self.attenuation:g}; it must be finite and not negative.")
+        super()._require_valid()
 
 
 @dataclass(frozen=True)

@@ -9,15 +9,18 @@ from typing import Any
 import numpy as np
 import torch
 from matplotlib.ticker import LogLocator, MaxNLocator, ScalarFormatter
+from PIL import Image
 
 from difftetvr.optics.transfer_function import TransferFunction
-from difftetvr.view.frames.lettering import Layer
+from difftetvr.view.frames.lettering import Ink, Layer
 
 ROOM = 0.16
 """Share of a picture's width, on its right, that a colour bar takes."""
 
 _LEFT, _WIDTH, _TOP, _BOTTOM = 1.0 - 0.88 * ROOM, 0.022, 0.22, 0.80
 _STEPS = 256
+_LEAST_ROOM = 72  # pixels of a bar beside a picture
+_LETTER = 0.64  # width of a digit, in heights of letters
 _FEWEST_DECADES = 1.0  # from which on ticks are powers of ten
 
 
@@ -84,7 +87,11 @@ def draw_color_bar(layer: Layer, scale: ColorScale) -> None:
         layer: Where to.
         scale: What it shows.
     """
-    left, right = _LEFT * layer.width, (_LEFT + _WIDTH) * layer.width
+    ticks, thickness = scale.ticks(), _WIDTH * layer.width
+    longest = max((len(label) for _, label in ticks if "$" not in label), default=0)
+    # Long numbers push the bar to the left, so that they end within the picture.
+    left = min(_LEFT * layer.width, layer.width - thickness - (1.2 + _LETTER * longest) * layer.letters)
+    right = left + thickness
     top, bottom = _TOP * layer.height, _BOTTOM * layer.height
     colors = scale.colors(_STEPS).numpy()[:, None]
     layer.axes.imshow(
@@ -92,9 +99,23 @@ def draw_color_bar(layer: Layer, scale: ColorScale) -> None:
     )
     layer.axes.set(xlim=(0, layer.width), ylim=(layer.height, 0))  # which an image changes
     layer.line([(left, top), (right, top), (right, bottom), (left, bottom), (left, top)])
-    for place, label in scale.ticks():
+    for place, label in ticks:
         y = bottom + place * (top - bottom)
         layer.line([(right, y), (right + 0.4 * layer.letters, y)])
         layer.text((right + 0.7 * layer.letters, y), label, across="left")
     # From the right edge of the picture, whatever its length.
     layer.text((layer.width - 0.6 * layer.letters, top - layer.letters), scale.label, across="right", along="bottom")
+
+
+def beside_color_bar(picture: Image.Image, scale: ColorScale, background: tuple[float, float, float]) -> Image.Image:
+    """A picture with a colour bar on its right, on a background R G B, instead of one in it."""
+    room = max(_LEAST_ROOM, round(ROOM * max(picture.size)))
+    whole = Image.new("RGB", (picture.width + room, picture.height), tuple(round(255 * v) for v in background))
+    whole.paste(picture, (0, 0))
+    # A sheet as wide as it is high, whose right end holds the bar in its usual size.
+    side = max(picture.height, round(room / ROOM))
+    layer = Layer(side, picture.height, Ink.on(background))
+    draw_color_bar(layer, scale)
+    bar = layer.drawn().crop((side - room, 0, side, picture.height))
+    whole.paste(bar, (picture.width, 0), bar)
+    return whole

@@ -15,7 +15,7 @@ from PIL import Image
 _DPI = 100
 _POINTS = 72
 _LETTERS = 1 / 42  # height of letters in the picture's shorter side
-_LEAST_LETTERS = 8.0  # pixels
+_LEAST_LETTERS = 10.0  # pixels
 _BRIGHT = 0.5
 
 

@@ -13,8 +13,8 @@ from difftetvr.view.looks.colormaps import DEFAULT_COLORMAP, colormap_colors
 from difftetvr.view.looks.distribution import Distribution
 from difftetvr.view.looks.opacities import OpacityPreset, opacity_knots
 
-_TAIL = 1e-3  # share of the volume at either end of the values that the usual range may leave out
-_MUCH_WIDER = 1.5  # than without these is the full range where it is not taken
+_TAILS = ((1e-3, 1.5), (5e-3, 10.0))
+"""Shares of the volume at either end of the values that the usual range leaves out if that narrows it so many times."""
 
 
 @dataclass(frozen=True)
@@ -25,8 +25,9 @@ class Appearance:
         colormap: Name of the colour map.
         opacity: Which values are how opaque, see `difftetvr.view.looks.opacities.opacity_knots`.
         value_range: Values at the ends of the colour map; None: as ``percentile`` says.
-        percentile: Per cent of the volume that lie below these ends; None: the least and the greatest value; where a
-            thousandth of the volume at either end widens that by more than half, the range without these.
+        percentile: Per cent of the volume that lie below these ends; None: the least and the greatest value, without
+            the thousandth of the volume at either end if these widen that by more than half, and without the next four
+            thousandths if these do more than ten times.
         is_log: Whether colours are spread over the logarithm of the values.
     """
 
@@ -78,13 +79,14 @@ class Appearance:
                     "others that lie farther apart, or --value-range."
                 )
             return low, high
-        full = distribution.ends
-        low, high = distribution.quantiles([_TAIL, 1.0 - _TAIL])
-        if low < high and self._extent(*full) > _MUCH_WIDER * self._extent(low, high):
-            return low, high
-        if not full[0] < full[1]:
-            raise MeshError(f"All values of '{name}' that can be shown are {full[0]:g}; give --value-range.")
-        return full
+        low, high = distribution.ends
+        if not low < high:
+            raise MeshError(f"All values of '{name}' that can be shown are {low:g}; give --value-range.")
+        for share, factor in _TAILS:
+            lower, upper = distribution.quantiles([share, 1.0 - share])
+            if lower < upper and self._extent(low, high) > factor * self._extent(lower, upper):
+                low, high = lower, upper
+        return low, high
 
     def _extent(self, low: float, high: float) -> float:
         return math.log(high) - math.log(low) if self.is_log else high - low
