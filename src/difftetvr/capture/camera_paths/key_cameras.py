@@ -8,13 +8,13 @@ from difftetvr.capture.camera_set import CameraSet
 from difftetvr.capture.viewing import Floats
 from difftetvr.rendering.cameras.pinhole import Camera
 
-_FRAMES_EACH = 20  # from one camera to the next, so that these can be seen
-_FEWEST = 4
+_FRAMES_EACH = 12  # from one camera to the next, so that these can be seen
+_FEWEST = 5
 _DETOUR = 1.5  # how much longer the order of the files may be than the one that is found
 
 
 def key_cameras_of(cameras: CameraSet, frames: int) -> list[Camera]:
-    """Some of the cameras of a capture, for a path through them: one for each twenty frames, four at least.
+    """Some of the cameras of a capture, for a path through them: one for each twelve frames, five at least.
 
     They lie evenly spread along a tour of all cameras: in the order of the capture where that hardly makes detours, as
     in a film, else from each camera to the nearest that is left.

@@ -9,6 +9,7 @@ import torch
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
+from difftetvr.capture.camera_set import CameraSet
 from difftetvr.capture.viewing import Floats, pose_of, positions_of
 from difftetvr.errors import CameraError, shown
 from difftetvr.rendering.cameras.pinhole import Camera
@@ -21,9 +22,12 @@ _LEAST_STEP = 1e-9  # between cameras that are not the same, in the size of the 
 def interpolated(cameras: Sequence[Camera], frames: int, loop: bool = False) -> list[Camera]:
     """Cameras along a path through given ones, evenly spaced.
 
-    Positions, focal lengths and principal points are cubic splines through those of the cameras, rotations the spline
-    of unit quaternions with a continuous angular acceleration (`scipy.spatial.transform.RotationSpline`), all over a
-    centripetal parameter: the square root of the distance, in which turning counts as moving does. Such splines make no
+    Rotations are the spline of unit quaternions with a continuous angular acceleration
+    (`scipy.spatial.transform.RotationSpline`). Focal lengths, principal points, what each camera looks at and how far
+    that is are cubic splines, and the position follows from these and the rotation: between cameras around an object
+    the path goes around it, and not through. What a camera looks at is the point of its optical axis next to where all
+    of these meet; where they do not meet in front of all cameras, it is the camera's own position. All this is over a
+    centripetal parameter, the square root of the distance, in which turning counts as moving does: such splines make no
     loops where cameras are close to each other. All frames have the size of the first camera.
 
     Args:
@@ -66,7 +70,9 @@ def require_frames(frames: int) -> None:
 
 
 class _Keys:
-    """Cameras as numbers: rotations (K, 3, 3) camera-to-world; and (K, 7) positions, and fx, fy, cx, cy in heights.
+    """Cameras as numbers: rotations (K, 3, 3) camera-to-world, and the other (K, 8).
+
+    These are the point that is looked at, its distance, and fx, fy, cx, cy in heights of the image.
 
     Distances are told in ``size``, the extent of all of them.
     """
@@ -81,12 +87,16 @@ class _Keys:
         lens = np.array([(c.fx, c.fy, c.cx - 0.5 * c.width, c.cy - 0.5 * c.height) for c in cameras])
         heights = np.array([camera.height for camera in cameras], dtype=np.float64)
         size = float(np.ptp(positions, axis=0).max()) or 1.0
-        numbers = np.concatenate([positions, lens / heights[:, None]], axis=1)
+        focus = CameraSet(list(cameras), torch.zeros(len(cameras), dtype=torch.bool), "path").focus
+        distance = ((focus - positions) * rotations[:, :, 2]).sum(1, keepdims=True)
+        distance = distance if (distance > 0.0).all() else np.zeros_like(distance)
+        numbers = np.concatenate([positions + distance * rotations[:, :, 2], distance, lens / heights[:, None]], axis=1)
         return _Keys(rotations, numbers, (cameras[0].width, cameras[0].height), size)
 
     @property
     def positions(self) -> Floats:
-        return self.numbers[:, :3]
+        """(K, 3) where the cameras are."""
+        return np.asarray(self.numbers[:, :3] - self.numbers[:, 3:4] * self.rotations[:, :, 2])
 
     def steps(self) -> Floats:
         """(K - 1,) from each camera to the next: its distance in the size of the path, and its angle in radians."""
@@ -116,5 +126,5 @@ class _Keys:
         pose = np.eye(4)
         pose[:3, :3] = self.rotations[index].T
         pose[:3, 3] = -pose[:3, :3] @ self.positions[index]
-        fx, fy, cx, cy = (height * self.numbers[index, 3:]).tolist()
+        fx, fy, cx, cy = (height * self.numbers[index, 4:]).tolist()
         return Camera(torch.from_numpy(pose), fx, fy, cx + 0.5 * width, cy + 0.5 * height, width, height)
