@@ -47,7 +47,7 @@ def interpolated(cameras: Sequence[Camera], frames: int, loop: bool = False) -> 
         return [keys.camera(0)] * frames
     if loop:
         keys = keys.wrapped()
-    begin, end = (_WRAPPED, len(keys.positions) - _WRAPPED) if loop else (0, len(keys.positions) - 1)
+    begin, end = (_WRAPPED, len(keys.positions) - _WRAPPED - 1) if loop else (0, len(keys.positions) - 1)
     times = np.concatenate([[0.0], np.sqrt(keys.steps()).cumsum()])
     curves = CubicSpline(times, keys.numbers, bc_type="natural")
     turns = RotationSpline(times, Rotation.from_matrix(keys.rotations))

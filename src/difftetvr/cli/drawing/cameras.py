@@ -230,10 +230,17 @@ class Place:
 
     def _looks_at_photographs(self) -> bool:
         """Whether the cameras of the capture say where the scene is looked at from."""
-        from difftetvr.capture import is_photo_source
+        from difftetvr.capture import TOOTH, is_photo_source, is_volume_file
 
         name = self._options.capture or (None if self._run is None else self._run.capture)
         if name is None:
+            return False
+        if not (name == TOOTH or is_volume_file(name) or Path(name).exists() or self._options.is_placed):
+            self._console.print(
+                f"Looked at from outside, as {name}, which it was fitted to, is no longer there; a --capture would say "
+                "from where.",
+                highlight=False,
+            )
             return False
         has_format = self._run is not None and self._run.capture_options.format is not None
         return has_format or is_photo_source(name) or self._options.capture is not None

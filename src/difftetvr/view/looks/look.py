@@ -66,7 +66,7 @@ class Appearance:
             if self.is_log and low <= 0.0:
                 raise MeshError(f"The range begins with {low:g}, which has no logarithm; begin with a number above 0.")
             return low, high
-        if self.is_log:
+        if self.is_log and distribution.ends[0] <= 0.0:
             positive = distribution.values > 0.0
             if not bool(positive.any()):
                 raise MeshError(f"No value of '{name}' is greater than 0, so none has a logarithm; leave out --log.")
