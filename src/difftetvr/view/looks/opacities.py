@@ -14,8 +14,8 @@ KNOTS = 65
 _SPREAD = 1.5  # standard deviation, in knots, of the smoothing of what is found at knots
 _REACH = 6  # knots on either side that it takes along
 
-_DEPTH_OF_RANGE = 3.0  # optical depth of a ray along which the scalar runs through all of its range once
-_MEAN_DEPTH = 1.2  # of all rays, where they are to be seen through
+_DEPTH_OF_RANGE = 4.0  # optical depth of a ray along which the scalar runs through all of its range once
+_MEAN_DEPTH = 2.0  # of all rays, where they are to be seen through
 _PEAKS, _PEAK_WIDTH, _DEPTH_OF_PEAK = 6, 0.02, 0.4
 
 
