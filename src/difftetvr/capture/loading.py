@@ -39,7 +39,7 @@ def load_cameras(source: str | Path, **overrides: Any) -> CameraSet:
     """The cameras of a capture, without its images: neither are photographs decoded nor volumes read or rendered.
 
     Args:
-        source: As for :func:`load_capture`.
+        source: As for :func:`difftetvr.load_capture`.
         **overrides: Likewise; all of them may be given, whether or not cameras depend on them.
 
     Raises:

@@ -42,7 +42,7 @@ class PaperOptions:
     """Which colour the scalar has where, beside it."""
     axes: bool = False
     """A box around it, with coordinates."""
-    unit: str = ""
+    unit: str | None = None
     """Unit of these, such as mm."""
 
 
@@ -174,7 +174,7 @@ class Render:
         style = FrameStyle(
             None if self.paper.transparent else self._background(place),
             subject.scale if has_bar else None,
-            subject.axes(self.paper.unit) if has_axes else None,
+            subject.axes(self.paper.unit or "") if has_axes else None,
         )
         if shots.fps is None:
             self._write_picture(subject, shots, style, console)

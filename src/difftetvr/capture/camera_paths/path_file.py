@@ -93,7 +93,9 @@ def load_camera_path(path: str | Path) -> CameraPath:
         raise CameraError(f"The camera path '{path}' has no cameras; give one or more.")
     cameras = [read(entry, f"camera {index} of the path '{path}'") for index, entry in enumerate(entries)]
     frames = _number(path, content, "frames") if is_own else None
-    loop = bool(content.get("loop", False)) and is_own
+    loop = content.get("loop", False) if is_own else False
+    if not isinstance(loop, bool):
+        raise CameraError(f"'loop' of the camera path '{path}' is {shown(loop)}; give true or false.")
     return CameraPath(cameras, None if frames is None else max(1, round(frames)), loop, _number(path, content, "fps"))
 
 

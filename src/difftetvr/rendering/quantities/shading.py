@@ -31,9 +31,9 @@ def render_shading(
 ) -> torch.Tensor:
     """Gradient shading: the mean shade of what each ray sees, by which the colours of an image are multiplied.
 
-    The shade of a cell is Lambert's, of both sides: ambient + (1 - ambient) |n . l|, with the direction l to the light
-    and the direction n of the gradient of the density, or of the scalar that a transfer function is applied to. The
-    gradient is that of the linear interpolant, averaged by volume at each vertex and then over the cell's four: a
+    The shade of a cell is Lambert's, of both sides: ambient + (1 - ambient) abs(n . l), with the direction l to the
+    light and the direction n of the gradient of the density, or of the scalar that a transfer function is applied to.
+    The gradient is that of the linear interpolant, averaged by volume at each vertex and then over the cell's four: a
     smooth scalar is shaded smoothly, though the shade is constant in a cell. Where it is 0 there is no side that light
     could fall on, and the shade is 1. Of the shades along a ray, the mean is weighted by the light that is absorbed
     there: the integral of T s shade over alpha, with the transmittance T and the density s. On an opaque surface it is

@@ -15,7 +15,7 @@ from difftetvr.mesh.field import Location
 _NEAR, _FAR = 0.5854101966249685, 0.1381966011250105
 """Weights of a cell's vertices at the four points of the rule that integrates quadratic functions exactly."""
 
-_MOST_VOXELS = 4_000_000
+_MOST_CELLS, _MOST_VOXELS = 1_000_000, 4_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class Distribution:
 
     @staticmethod
     def of_scalars(mesh: TetMesh, values: torch.Tensor, location: Location) -> Distribution:
-        """Four samples of each cell; one where a scalar is constant in cells.
+        """Four samples of each cell, of very many of some; one of each where a scalar is constant in cells.
 
         The slope of such a one is that of its means at the vertices: it says which values lie beside others.
 
@@ -48,6 +48,8 @@ class Distribution:
             location: Where they live.
         """
         cells, numbers = mesh.tets.long().cpu(), values.detach().cpu().double()
+        if location == "vertex":
+            cells = cells[:: max(1, len(cells) // _MOST_CELLS)]  # of so many, every few tell the same
         corners = mesh.vertices.detach().cpu().double()[cells]
         edges = corners[:, 1:] - corners[:, :1]
         # So that no volume vanishes or overflows, however small or large the mesh is.
@@ -60,7 +62,8 @@ class Distribution:
         if location == "vertex":
             inner = at_vertices[cells]
             numbers = (_FAR * inner.sum(1, keepdim=True) + (_NEAR - _FAR) * inner).flatten()
-            volumes, slopes = (0.25 * volumes).repeat_interleave(4), slopes.repeat_interleave(4)
+            share = mesh.num_cells / len(cells) / 4.0
+            volumes, slopes = (share * volumes).repeat_interleave(4), slopes.repeat_interleave(4)
         return Distribution(numbers, volumes, slopes, _surface(mesh, size), ends)
 
     @staticmethod
