@@ -30,6 +30,7 @@ CAMERA_GROUPS = {
 _DIRECTION = (0.55, -1.0, 0.55)
 _UP, _FOV, _SIZE, _FRAMES, _FPS = (0.0, 0.0, 1.0), 53.13, 512, 120, 24.0
 _FILLED = 0.94  # of the picture, by the box of what is shown
+_TURNS, _HALVINGS = 72, 50
 _LEAST_SIZE, _MOST_SIZE = 1e-150, 1e150  # of meshes, so that squares of lengths are numbers
 _MOST_FRAMES = 100_000
 
@@ -316,29 +317,59 @@ class Place:
             return Camera.look_at(options.eye, target, up, fov_y, width, height)
         direction = torch.tensor(_DIRECTION, dtype=torch.float64)
         direction = direction / direction.norm()
-        free = (_FILLED * (1.0 - room[0]) - 2.0 * room[1] * (1.0 - room[0]), _FILLED - 2.0 * room[1])
         # One far away has the axes of all that look this way.
         far = Camera.look_at(target + 10.0 * size * direction, target, up, fov_y, width, height)
-        distance = _distance(far, bounds - target, free)
+        free = ((1.0 - room[0]) * (_FILLED - 2.0 * room[1]), _FILLED - 2.0 * room[1])
+        distance, (x, y) = _fitted(far, self._corners(bounds - target, up), free)
         camera = Camera.look_at(target + distance * direction, target, up, fov_y, width, height)
-        shift = 0.5 * room[0] * camera.width if options.target is None else 0.0
-        return Camera(camera.world_to_camera, camera.fx, camera.fy, camera.cx - shift, camera.cy, width, height)
+        if options.target is not None:
+            return camera  # which is to be in the middle
+        cx, cy = 0.5 * (1.0 - room[0]) * width - x * camera.fx, 0.5 * height - y * camera.fy
+        return Camera(camera.world_to_camera, camera.fx, camera.fy, cx, cy, width, height)
+
+    def _corners(self, box: torch.Tensor, up: tuple[float, float, float]) -> torch.Tensor:
+        """(N, 3) points whose hull is seen: corners of a box, of a turntable's all that it turns through."""
+        import itertools
+
+        import numpy as np
+        import torch
+        from scipy.spatial.transform import Rotation
+
+        corners = torch.stack([torch.stack(corner) for corner in itertools.product(*box.T)])
+        axis = np.array(up) / max(float(np.linalg.norm(up)), 1e-300)
+        if self._options.film.turntable is None or not axis.any():
+            return corners
+        angles = np.linspace(0.0, 2.0 * np.pi, _TURNS, endpoint=False)
+        return torch.from_numpy(
+            np.concatenate([turn.apply(corners) for turn in Rotation.from_rotvec(np.outer(angles, axis))])
+        )
 
 
-def _distance(camera: Camera, box: torch.Tensor, free: tuple[float, float]) -> float:
-    """How far from a point a camera sees a box around it within shares of the picture, as near as that allows.
+def _fitted(camera: Camera, points: torch.Tensor, free: tuple[float, float]) -> tuple[float, tuple[float, float]]:
+    """How far from a target a camera sees points around it within shares of the picture, as near as that allows.
 
     Args:
         camera: Any that looks so.
-        box: (2, 3) corners, seen from the point.
+        points: (N, 3), seen from the target.
         free: Shares of the width and the height.
+
+    Returns:
+        The distance, and where the middle of what is seen then lies in the plane at distance 1.
     """
-    import itertools
+    right, down, forward = camera.world_to_camera[:3, :3].double().cpu() @ points.T
+    room = (free[0] * camera.width / camera.fx, free[1] * camera.height / camera.fy)
+    nearest, size = -float(forward.min()), float(points.norm(dim=1).max())
 
-    import torch
+    def extents(distance: float) -> list[tuple[float, float]]:
+        seen = [across / (forward + distance) for across in (right, down)]
+        return [(float(across.min()), float(across.max())) for across in seen]
 
-    corners = torch.stack([torch.stack(corner) for corner in itertools.product(*box.T)])
-    right, down, forward = camera.world_to_camera[:3, :3].double() @ corners.T
-    tangents = (free[0] * 0.5 * camera.width / camera.fx, free[1] * 0.5 * camera.height / camera.fy)
-    needed = [(across.abs() / tangent - forward).max() for across, tangent in zip((right, down), tangents)]
-    return max(float(distance) for distance in needed)
+    near, far = nearest, nearest + 2.0 * size / min(*room, 1.0)
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (near + far)
+        fits = middle > nearest and all(
+            high - low <= share for (low, high), share in zip(extents(middle), room, strict=True)
+        )
+        near, far = (near, middle) if fits else (middle, far)
+    (left, rightmost), (top, bottom) = extents(far)
+    return far, (0.5 * (left + rightmost), 0.5 * (top + bottom))
