@@ -248,3 +248,24 @@ def test_cuts_of_models_of_photographs_leave_the_surroundings_out(photo_run, tmp
     whole = draw("cut", photo_run.rename(tmp_path / "alone.vtu"), "-o", tmp_path / "a.png", "--no-cells", "--size", 64)
     shares = [(picture[..., 0] > 60).mean() for picture in (near, whole)]
     assert shares[0] > 1.5 * shares[1] > 0
+
+
+@pytest.mark.parametrize(
+    ("low", "high"), [(-1.7e308, 1.7e308), (1e-310, 1e-300), (1e-290, 1e300), (-3e-30, 5e-30), (1e9, 1e9 + 1e-3)]
+)
+def test_looks_do_not_depend_on_the_unit_of_a_scalar(tmp_path, low, high, recwarn):
+    mesh = dtv.TetMesh.grid((4, 4, 4))
+    share = mesh.vertices[:, 2].double().numpy()
+    pictures = []
+    for ends in ((0.0, 1.0), (low, high)):
+        scalar = ends[0] * (1.0 - share) + ends[1] * share
+        np.savez(tmp_path / "a.npz", vertices=mesh.vertices.numpy(), tets=mesh.tets.numpy(), s=scalar)
+        pictures.append(draw("render", tmp_path / "a.npz", "-o", tmp_path / "a.png", *SMALL))
+        draw(
+            "render", tmp_path / "a.npz", "-o", tmp_path / "b.png", *SMALL, "--opacity", "peak", "--shade", "--colorbar"
+        )
+        draw("cut", tmp_path / "a.npz", "-o", tmp_path / "b.png", "--size", 32, "--colorbar")
+        if ends[0] > 0:
+            draw("render", tmp_path / "a.npz", "-o", tmp_path / "b.png", *SMALL, "--log", "--colorbar")
+    assert pictures[0].max() > 60 and np.abs(pictures[0] - pictures[1]).max() <= 3
+    assert not recwarn.list

@@ -28,6 +28,7 @@ SCALAR_GROUP = (
 )
 """Names of all options below."""
 
+_LEAST_KEPT, _MOST_KEPT = 1e-120, 1e120
 _ATTENUATION = 25.0  # of a transfer function from a file, as in the published experiments
 
 
@@ -80,12 +81,7 @@ class ColorOptions:
             raise MeshError(
                 f"The scalar '{scalar.name}' of {path} is {value:g} everywhere; name another, or give --value-range."
             )
-        value_range = None
-        if self.value_range is not None:
-            value_range = (
-                scalar.counted_from_offset(self.value_range[0]),
-                scalar.counted_from_offset(self.value_range[1]),
-            )
+        value_range = self._range_from_offset(scalar)
         lower, upper = data.mesh.bounds()
         longest = float((upper - lower).max())
         if self.transfer_function is not None:
@@ -93,7 +89,7 @@ class ColorOptions:
             field = ScalarField(scalar.values, function, density / longest, value_range, scalar.location)
             scale = _scale(scalar, function, value_range or (low, high), None)
         else:
-            look = self._look(self._distribution(scalar), value_range, scalar.name)
+            look = self._look_of(scalar, value_range)
             density = self._density(look.attenuation)
             function = look.transfer_function
             field = ScalarField(scalar.values, function, density / longest, look.value_range, scalar.location)
@@ -121,34 +117,51 @@ class ColorOptions:
         if function is not None:
             density = self._density(_ATTENUATION)
             return ShownVolume(volume, function, density, ColorScale("value", (low, high), function))
-        # In the values of the file, of which logarithms are to be taken.
+        # In the values of the file, of which logarithms are to be taken; but for a factor, so that nothing overflows.
+        unit = _unit_of(low, high)
+        low, high = unit * low, unit * high
         found = Distribution.of_volume(volume)
         ends = (low + (high - low) * found.ends[0], low + (high - low) * found.ends[1])
         in_file = replace(
             found, values=low + (high - low) * found.values, slopes=(high - low) * found.slopes, ends=ends
         )
-        look = self._look(in_file, self.value_range, volume.name)
-        start, end = ((value - low) / (high - low) for value in look.value_range)
+        look = self._look(in_file, self.value_range, volume.name, unit)
+        start, end = ((unit * value - low) / (high - low) for value in look.value_range)
         values = ((volume.values - start) / (end - start)).clip(0.0, 1.0).astype(np.float32)
         shown = replace(volume, values=values, value_range=look.value_range)
         density = self._density(look.attenuation)
         scale = ColorScale("value", look.value_range, look.transfer_function, look.is_log)
         return ShownVolume(shown, look.transfer_function, density, scale)
 
-    def _look(self, distribution: Distribution, value_range: tuple[float, float] | None, name: str) -> Look:
+    def _range_from_offset(self, scalar: Scalar) -> tuple[float, float] | None:
+        """The range that is given, in the numbers that stand for a scalar."""
+        if self.value_range is None:
+            return None
+        low, high = (scalar.counted_from_offset(value) for value in self.value_range)
+        return low, high
+
+    def _look_of(self, scalar: Scalar, value_range: tuple[float, float] | None) -> Look:
+        """The look of a scalar of a mesh."""
+        from difftetvr.view.looks import Distribution
+
+        unit = _unit_of(float(scalar.values.min()), float(scalar.values.max()))
+        distribution = Distribution.of_scalars(scalar.mesh, unit * scalar.values.double(), scalar.location)
+        return self._look(distribution, value_range, scalar.name, unit)
+
+    def _look(
+        self, distribution: Distribution, value_range: tuple[float, float] | None, name: str, unit: float
+    ) -> Look:
+        """The look of a scalar whose values are those of the distribution divided by a unit, as its range is."""
         from difftetvr.view.looks import Appearance
 
+        value_range = None if value_range is None else (unit * value_range[0], unit * value_range[1])
         usual = Appearance()
         appearance = Appearance(
             self.colormap or usual.colormap, self._opacity() or usual.opacity, value_range, self.percentile, self.log
         )
-        return appearance.look(distribution, name)
-
-    @staticmethod
-    def _distribution(scalar: Scalar) -> Distribution:
-        from difftetvr.view.looks import Distribution
-
-        return Distribution.of_scalars(scalar.mesh, scalar.values, scalar.location)
+        look = appearance.look(distribution, name)
+        low, high = look.value_range
+        return replace(look, value_range=(low / unit, high / unit))
 
     def _loaded(self, path: Path) -> tuple[TransferFunction, float]:
         from difftetvr.optics.transfer_function import TransferFunction
@@ -228,6 +241,14 @@ class ShownVolume:
     function: TransferFunction
     density: float
     scale: ColorScale
+
+
+def _unit_of(low: float, high: float) -> float:
+    """A power of two that brings numbers into the range in which squares, differences and sums of them are numbers."""
+    largest = max(abs(low), abs(high))
+    if _LEAST_KEPT < largest < _MOST_KEPT or largest == 0.0:
+        return 1.0
+    return 2.0 ** -min(max(math.frexp(largest)[1], -1000), 1020)
 
 
 def _scale(

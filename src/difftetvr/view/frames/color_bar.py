@@ -13,6 +13,7 @@ from PIL import Image
 
 from difftetvr.optics.transfer_function import TransferFunction
 from difftetvr.view.frames.lettering import Ink, Layer
+from difftetvr.view.looks.look import logarithmic
 
 ROOM = 0.16
 """Share of a picture's width, on its right, that a colour bar takes."""
@@ -43,15 +44,16 @@ class ColorScale:
     def colors(self, count: int) -> torch.Tensor:
         """(count, 3) colours along the bar, from its lower end."""
         along = torch.linspace(0.0, 1.0, count, dtype=torch.float64)
-        low, high = self.value_range
         if self.is_log:
-            ratio = math.log(high) - math.log(low)
-            along = torch.expm1(along * ratio) / math.expm1(ratio)
+            low, high = self.value_range
+            along = logarithmic(along, low, high)
         return self.transfer_function(along)[0].detach().clamp(0.0, 1.0)
 
     def ticks(self) -> list[tuple[float, str]]:
         """Where along the bar, from 0 to 1, numbers stand, and these."""
         low, high = self.value_range
+        if not math.isfinite(high - low):
+            return [(0.0, f"{low:.3g}"), (1.0, f"{high:.3g}")]
         has_decades = self.is_log and math.log10(high) - math.log10(low) >= _FEWEST_DECADES
         locator = LogLocator(numticks=8) if has_decades else MaxNLocator(6)
         values = [float(value) for value in locator.tick_values(low, high) if low <= value <= high]

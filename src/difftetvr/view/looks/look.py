@@ -103,8 +103,24 @@ class Appearance:
         """(K,) the inverse, in units of the range: a transfer function knows nothing of logarithms."""
         if not self.is_log:
             return positions
-        ratio = math.log(high) - math.log(low)
-        return (torch.expm1(positions * ratio) / math.expm1(ratio)).clamp(0.0, 1.0)
+        return logarithmic(positions, low, high)
+
+
+def logarithmic(positions: torch.Tensor, low: float, high: float) -> torch.Tensor:
+    """Where in a range values lie that lie somewhere on a logarithmic scale of it.
+
+    Args:
+        positions: (K,) on the scale, in [0, 1].
+        low: Lower end of the range, > 0.
+        high: Its upper end.
+
+    Returns:
+        (K,) in [0, 1].
+    """
+    ratio = math.log(high) - math.log(low)
+    # From the upper end, whose exponential does not overflow.
+    shares = (torch.exp((positions - 1.0) * ratio) - math.exp(-ratio)) / -math.expm1(-ratio)
+    return shares.clamp(0.0, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
