@@ -48,6 +48,7 @@ from .rendering.cell_features import CellFeatures as CellFeatures
 from .rendering.quantities.along_rays import depth_at as depth_at
 from .rendering.quantities.along_rays import transmittance_at as transmittance_at
 from .rendering.quantities.normals import render_normals as render_normals
+from .rendering.quantities.shading import render_shading as render_shading
 from .rendering.rays import Rays as Rays
 from .rendering.rays import RaySource as RaySource
 from .rendering.scalar_field import ScalarField as ScalarField
@@ -99,6 +100,7 @@ __all__ = [
     "probe",
     "render",
     "render_normals",
+    "render_shading",
     "save",
     "save_grid",
     "save_surface",

@@ -14,9 +14,9 @@ from PIL import Image
 
 import difftetvr.cli as cli
 from difftetvr.capture import Capture
-from difftetvr.cli.render import Render
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.mesh.io import load, save
+from difftetvr.rendering import Camera
 
 
 def test_fit_fills_its_folder(run):
@@ -104,7 +104,7 @@ def test_info_describes_meshes_and_captures(run, tmp_path, capsys):
     assert "12 x 10" in capsys.readouterr().out
     image = torch.rand(2, 12, 14, 3)
     mesh, field = load(run / "model.vtu")
-    camera = Render(model=run, output=run, width=14, height=12)._camera(mesh)
+    camera = Camera.look_at((0.0, -2.0, 0.5), (0.0, 0.0, 0.0), width=14, height=12)
     bounds = torch.tensor([[0.0, 0, 0], [1, 1, 1]])
     Capture([camera] * 2, image, None, torch.tensor([False, True]), bounds, "photos").save(tmp_path / "photos.npz")
     save(tmp_path / "mesh.npz", mesh, field)

@@ -140,7 +140,11 @@ def test_options_before_positional_arguments_leave_these_alone(option):
     command = cli.parse_command(
         ["render", "--eye", "1", "-2", "3", "--background", "1", "1", "1", "a.vtu", "-o", "p.png"]
     )
-    assert command.eye == (1.0, -2.0, 3.0) and command.background == (1.0, 1.0, 1.0) and command.model.name == "a.vtu"
+    assert (
+        command.view_from.eye == (1.0, -2.0, 3.0)
+        and command.background == (1.0, 1.0, 1.0)
+        and command.model.name == "a.vtu"
+    )
 
 
 def test_none_leaves_options_of_every_type_open():

@@ -1,3 +1,5 @@
+from . import camera_paths as camera_paths
+from . import camera_set as camera_set
 from . import capture as capture
 from . import capture_file as capture_file
 from . import degenerate as degenerate
@@ -10,7 +12,9 @@ from . import photos as photos
 from . import projections as projections
 from . import viewing as viewing
 from . import volumes as volumes
+from .camera_set import CameraSet as CameraSet
 from .capture import Capture as Capture
+from .loading import load_cameras as load_cameras
 from .loading import load_capture as load_capture
 from .orbit import fibonacci_orbit as fibonacci_orbit
 from .orbit import random_orbit as random_orbit
@@ -34,6 +38,7 @@ from .volumes.voxels import load_volume as load_volume
 
 __all__ = [
     "TOOTH",
+    "CameraSet",
     "Capture",
     "CaptureWarning",
     "MixedImages",
@@ -50,6 +55,7 @@ __all__ = [
     "is_photo_source",
     "is_projection_source",
     "is_volume_file",
+    "load_cameras",
     "load_capture",
     "load_volume",
     "project_volume",

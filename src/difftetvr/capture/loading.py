@@ -7,6 +7,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
+from difftetvr.capture.camera_set import CameraSet
 from difftetvr.capture.capture import Capture
 from difftetvr.capture.photos.photo_capture import PhotoCapture, is_photo_source
 from difftetvr.capture.photos.readers.foreign import known_export
@@ -30,18 +31,42 @@ def load_capture(source: str | Path, **overrides: Any) -> Capture:
         CaptureError: The source or an override is not known or not valid.
     """
     require_type(source, (str, PathLike), "The source", "pass the path of a capture, or 'tooth'", CaptureError)
+    description = _description(source, overrides)
+    return Capture.load(source) if description is None else description.build()
+
+
+def load_cameras(source: str | Path, **overrides: Any) -> CameraSet:
+    """The cameras of a capture, without its images: neither are photographs decoded nor volumes read or rendered.
+
+    Args:
+        source: As for :func:`difftetvr.load_capture`.
+        **overrides: Likewise; all of them may be given, whether or not cameras depend on them.
+
+    Raises:
+        CaptureError: The source or an override is not known or not valid.
+    """
+    require_type(source, (str, PathLike), "The source", "pass the path of a capture, or 'tooth'", CaptureError)
+    description = _description(source, overrides)
+    if description is not None:
+        return description.camera_set()
+    capture = Capture.load(source)
+    return CameraSet(capture.cameras, capture.test, capture.name)
+
+
+def _description(source: str | Path, overrides: dict[str, Any]) -> VolumeCapture | PhotoCapture | None:
+    """What says how a source is read; None for a saved capture, which is read as it is."""
     chosen = {key: value for key, value in overrides.items() if value is not None}
     kind = _kind(source, chosen)
     if kind is None:
         if chosen:
             raise CaptureError(f"The saved capture '{source}' is read as it is; leave out '{sorted(chosen)[0]}'.")
-        return Capture.load(source)
+        return None
     known = {field.name for field in fields(kind)} - {"path"}
     unknown = sorted(set(chosen) - known)
     if unknown:
         what = "A capture of photos" if kind is PhotoCapture else "A capture of a volume"
         raise CaptureError(f"{what} has no setting '{unknown[0]}'; known are {', '.join(sorted(known))}.")
-    return kind(path=str(source), **chosen).build()
+    return kind(path=str(source), **chosen)
 
 
 def _kind(source: str | Path, chosen: dict[str, Any]) -> type[VolumeCapture | PhotoCapture] | None:

@@ -23,9 +23,11 @@ if TYPE_CHECKING:
 
     from difftetvr.capture.capture import Capture
     from difftetvr.capture.volumes.summary import VolumeSummary
+    from difftetvr.capture.volumes.volume import Volume
     from difftetvr.mesh.field import Field
     from difftetvr.mesh.io import MeshData
     from difftetvr.mesh.tetmesh import TetMesh
+    from difftetvr.optics.transfer_function import TransferFunction
 
 # Half an hour on two cores; beyond, a reconstruction from photographs takes hours there.
 _LONGEST_SIDE, _LONGEST_SIDE_ON_CUDA = 240, 1600
@@ -199,6 +201,46 @@ class MeshOptions:
             for warning in data.warnings:
                 console.print(warning)
         return data
+
+
+@dataclass(frozen=True)
+class VolumeOptions:
+    """How a volume is read."""
+
+    shape: tuple[int, int, int] | None = None
+    """Samples along x, y and z of a .raw volume without a header."""
+    dtype: str | None = None
+    """NumPy type of a .raw volume without a header, such as uint8."""
+    spacing: tuple[float, float, float] | None = None
+    """Distances of samples of a volume along x, y and z; default: the file's."""
+
+    def given(self) -> list[str]:
+        """Names of those that are given."""
+        return [item.name for item in dataclasses.fields(self) if getattr(self, item.name) is not None]
+
+    def load(
+        self,
+        name: str,
+        transfer_function: Path | None,
+        value_range: tuple[float, float] | None,
+        console: Console,
+    ) -> tuple[Volume, TransferFunction | None]:
+        """The volume of a name, and the transfer function that belongs to it.
+
+        Args:
+            name: Its path, or ``tooth``, which has a transfer function of its own.
+            transfer_function: File of another one; None: none is read.
+            value_range: Values that stand for 0 and 1 of it; of volumes without one all values are kept.
+            console: Where to say what was found.
+        """
+        from difftetvr.capture import TOOTH, Volume, VolumeCapture
+
+        given = None if transfer_function is None else str(transfer_function)
+        with saying(console), waiting(console, f"Reading {name}"):
+            if given is not None or name == TOOTH:
+                source = VolumeCapture(name, self.shape, self.dtype, self.spacing, given, value_range=value_range)
+                return source.load_volume()
+            return Volume.load(name, self.shape, self.dtype, self.spacing), None
 
 
 def color_of(background: Color) -> tuple[float, float, float]:

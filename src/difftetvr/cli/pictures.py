@@ -11,8 +11,11 @@ import tyro
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from difftetvr.cli.arguments import Groups
+from difftetvr.cli.drawing.cameras import CameraOptions, Place
+from difftetvr.cli.drawing.scalars import COLOR_GROUP, ColorOptions
 from difftetvr.cli.options import (
     CAPTURE_GROUPS,
+    TRUST_GROUPS,
     CaptureOptions,
     Color,
     MeshOptions,
@@ -96,35 +99,57 @@ class Compare:
 
 @dataclass(frozen=True)
 class Cut:
-    """Draw a cut through a model: what it holds, and its cells."""
+    """Draw a cut through a mesh: its colours, or a scalar, and its cells."""
 
     model: Annotated[Path, Positional, arg(metavar="MODEL")]
-    """Mesh with color and density."""
+    """Mesh with color and density, or with scalars. Of what was fitted to photographs, the part that these look at is
+    drawn, and not all of its surroundings."""
     output: Output
     """The picture, .png."""
     normal: tuple[float, float, float] = (1.0, 0.0, 0.0)
     """Direction in which the cut is looked at."""
     origin: tuple[float, float, float] | None = None
-    """A point of the cut; default: the centre of the mesh."""
+    """A point of the cut; default: the centre of the mesh, or of what photographs look at."""
     size: int = 1024
     """Pixels of the longer side."""
     no_cells: bool = False
     """Leave the outlines of the cells out."""
     background: Color = "black"
     """Behind what is cut: black, white or R G B."""
+    colorbar: bool = False
+    """Which colour the scalar has where, beside the cut."""
+    scalars: OmitArgPrefixes[ColorOptions] = field(default_factory=ColorOptions)
+    mesh: OmitArgPrefixes[MeshOptions] = field(default_factory=MeshOptions)
+    trust: OmitArgPrefixes[TrustOptions] = field(default_factory=TrustOptions)
+    groups: ClassVar[Groups] = {
+        "Cut": ("normal", "origin", "size", "no-cells", "background", "colorbar"),
+        "Scalars of a simulation": COLOR_GROUP,
+        "How MODEL is read": ("split", "step"),
+        **TRUST_GROUPS,
+    }
 
     def run(self, console: Console) -> None:
         """Draws and writes the picture."""
         from difftetvr.view.cut import Plane, cut_picture
+        from difftetvr.view.frames.color_bar import beside_color_bar
         from difftetvr.view.pictures import require_png, save_picture
 
         require_png(self.output)
         require_writable(self.output, CaptureError)
         if not 2 <= self.size <= _MOST_PIXELS:
             raise CaptureError(f"--size is {self.size}; it must lie between 2 and {_MOST_PIXELS}.")
-        data = MeshOptions().load(self.model, console, require_field=True)
-        assert data.field is not None
-        plane, background = Plane(self.normal, self.origin), color_of(self.background)
-        picture = cut_picture(data.mesh, data.field, plane, self.size, not self.no_cells, background)
+        background, place = color_of(self.background), Place(self.model, CameraOptions(), console)
+        shown = self.scalars.apply(self.mesh.load(self.model, console), self.model)
+        if self.colorbar and shown.scale is None:
+            raise CaptureError(f"{self.model} shows its own colours, not a scalar's; leave out --colorbar.")
+        if shown.note is not None:
+            console.print(shown.note)
+        views = place.views
+        origin = self.origin if views is None or self.origin is not None else tuple(views.focus.tolist())
+        within = None if views is None else views.inner_bounds
+        plane = Plane(self.normal, origin)
+        picture = cut_picture(shown.mesh, shown.field, plane, self.size, not self.no_cells, background, within)
+        if self.colorbar and shown.scale is not None:
+            picture = beside_color_bar(picture, shown.scale, background)
         save_picture(self.output, picture)
         console.print(f"Wrote {self.output} ({picture.width} x {picture.height})")

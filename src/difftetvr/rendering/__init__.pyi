@@ -26,6 +26,7 @@ from .cell_features import CellFeatures as CellFeatures
 from .quantities.along_rays import depth_at as depth_at
 from .quantities.along_rays import transmittance_at as transmittance_at
 from .quantities.normals import render_normals as render_normals
+from .quantities.shading import render_shading as render_shading
 from .rays import Rays as Rays
 from .rays import RaySource as RaySource
 from .scalar_field import ScalarField as ScalarField
@@ -47,6 +48,7 @@ __all__ = [
     "load_camera",
     "render",
     "render_normals",
+    "render_shading",
     "save_camera",
     "transmittance_at",
 ]

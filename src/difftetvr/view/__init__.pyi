@@ -2,7 +2,9 @@ from . import blank as blank
 from . import compare as compare
 from . import cut as cut
 from . import describe as describe
+from . import frames as frames
 from . import heatmap as heatmap
+from . import looks as looks
 from . import page as page
 from . import pictures as pictures
 from . import plots as plots

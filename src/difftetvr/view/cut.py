@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +13,7 @@ from difftetvr.errors import MeshError, shown
 from difftetvr.mesh.field import Field, Location
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.mesh.topology.topology import LOCAL_EDGES
+from difftetvr.rendering.scalar_field import ScalarField
 
 _SMOOTHING = 2  # lines are drawn so many times larger, and shrunk
 _PIXELS_AT_ONCE = 2_000_000
@@ -50,37 +52,60 @@ class Plane:
 
 @dataclass(frozen=True)
 class _Section:
-    """Triangles (N, 3, 2) in the plane with colours (N, 3, 3), and outlines (M, 2, 2) of the cells' sections."""
+    """Triangles (N, 3, 2) in the plane with values (N, 3, C), and outlines (M, 2, 2) of the cells' sections."""
 
     triangles: np.ndarray
-    colors: np.ndarray
+    values: np.ndarray
     outlines: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Paint:
+    """What a cut shows: values (V, C) or (T, C) on a mesh, and the (P, 3) colours of (P, C) interpolated ones."""
+
+    values: np.ndarray
+    location: Location
+    colors_of: Callable[[np.ndarray], np.ndarray]
+
+    @staticmethod
+    def of(mesh: TetMesh, field: Field | ScalarField, background: np.ndarray) -> _Paint:
+        if isinstance(field, Field):
+            return _Paint(_slab_colors(mesh, field, background), field.location_on(mesh), lambda colors: colors)
+        scalars = field.normalised().detach().double().cpu().numpy()[:, None]
+        function = field.transfer_function
+        return _Paint(scalars, field.location_on(mesh), lambda values: function(values[:, 0])[0])
 
 
 def cut_picture(
     mesh: TetMesh,
-    field: Field,
+    field: Field | ScalarField,
     plane: Plane | None = None,
     size: int = 512,
     outlines: bool = True,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    within: torch.Tensor | None = None,
 ) -> Image.Image:
-    """Draws a cut through a mesh: its colours as a slab looks that is a twentieth of the mesh thick, and its cells.
+    """Draws a cut through a mesh, and its cells.
+
+    Colours and densities as a slab looks that is a twentieth of the mesh thick; scalars in the colours of their
+    transfer function, opaque, of the interpolated scalar in every pixel.
 
     Args:
         mesh: The mesh.
-        field: Its colours and densities.
+        field: Its colours and densities, or scalars.
         plane: Where to cut; default: through the centre, seen along x.
         size: Pixels of the picture's longer side.
         outlines: Whether to draw the cells.
         background: R G B behind the slab and beside the mesh.
+        within: (2, 3) corners of a box that the picture is cropped to; None: all of the cut is drawn.
 
     Raises:
-        MeshError: The plane misses the mesh, or its normal is no direction.
+        MeshError: The plane misses the mesh or the box, or its normal is no direction.
     """
-    section = _section(mesh, plane or Plane(), _slab_colors(mesh, field, np.array(background)), field.location_on(mesh))
-    points = section.outlines.reshape(-1, 2)
-    lower, extent = points.min(0), np.ptp(points, axis=0)
+    plane, paint = plane or Plane(), _Paint.of(mesh, field, np.array(background))
+    section = _section(mesh, plane, paint.values, paint.location)
+    lower, upper = _cropped(section, mesh, plane, within)
+    extent = upper - lower
     scale = (size - 1) / extent.max()
     width, height = (max(1, round(float(side * scale)) + 1) for side in extent)
 
@@ -88,19 +113,43 @@ def cut_picture(
         place = (place - lower) * scale
         return np.stack((place[..., 0], height - 1 - place[..., 1]), -1)
 
-    pixels = _fill(np.tile(np.array(background), (height, width, 1)), to_pixels(section.triangles), section.colors)
+    blank = np.tile(np.array(background), (height, width, 1))
+    pixels = _fill(blank, to_pixels(section.triangles), section.values, paint.colors_of)
     picture = Image.fromarray((255.0 * pixels.clip(0, 1)).round().astype(np.uint8))
     line = (0, 0, 0) if sum(background) > 1.5 else (255, 255, 255)
     return _with_outlines(picture, to_pixels(section.outlines), line) if outlines else picture
 
 
-def _section(mesh: TetMesh, plane: Plane, colors: np.ndarray, location: Location) -> _Section:
-    """Where a plane cuts a mesh with colours on its vertices or its cells."""
+def _cropped(
+    section: _Section, mesh: TetMesh, plane: Plane, within: torch.Tensor | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """(2,) lower and (2,) upper corner of what is drawn, in the plane."""
+    points = section.outlines.reshape(-1, 2)
+    lower, upper = points.min(0), points.max(0)
+    if within is None:
+        return lower, upper
+    right, up, _ = plane.axes()
+    corners = np.stack(np.meshgrid(*within.detach().double().cpu().numpy().T, indexing="ij"), -1).reshape(-1, 3)
+    places = (corners - _origin(mesh, plane)) @ np.stack((right, up), 1)
+    lower, upper = np.maximum(lower, places.min(0)), np.minimum(upper, places.max(0))
+    if not (lower < upper).all():
+        raise MeshError("The cut misses the box that it is to be cropped to; move its origin.")
+    return lower, upper
+
+
+def _origin(mesh: TetMesh, plane: Plane) -> np.ndarray:
+    """(3,) a point of the plane."""
+    if plane.origin is not None:
+        return np.asarray(plane.origin, dtype=np.float64)
+    return mesh.bounds().detach().double().cpu().numpy().mean(0)
+
+
+def _section(mesh: TetMesh, plane: Plane, values: np.ndarray, location: Location) -> _Section:
+    """Where a plane cuts a mesh with values on its vertices or its cells."""
     positions = mesh.vertices.detach().double().cpu().numpy()
-    center = 0.5 * (positions.min(0) + positions.max(0))
     size = float(np.linalg.norm(np.ptp(positions, axis=0)))
     right, up, normal = plane.axes()
-    origin = center if plane.origin is None else np.asarray(plane.origin)
+    origin = _origin(mesh, plane)
     height = (positions - origin) @ normal + _ASIDE * size
     tets = mesh.tets.cpu().numpy()
     above = height[tets] > 0
@@ -116,7 +165,7 @@ def _section(mesh: TetMesh, plane: Plane, colors: np.ndarray, location: Location
         share = (height[one] / (height[one] - height[other]))[:, None]
         place = (1 - share) * positions[one] + share * positions[other]
         places.append(np.stack(((place - origin) @ right, (place - origin) @ up), 1))
-        shades.append(colors[crossed] if per_cell else (1 - share) * colors[one] + share * colors[other])
+        shades.append(values[crossed] if per_cell else (1 - share) * values[one] + share * values[other])
         owners.append(crossed)
     return _polygons(np.concatenate(places), np.concatenate(shades), np.concatenate(owners))
 
@@ -146,18 +195,24 @@ def _slab_colors(mesh: TetMesh, field: Field, background: np.ndarray) -> np.ndar
     return (color * opacity).numpy() + background * (1.0 - opacity.numpy())
 
 
-def _fill(image: np.ndarray, triangles: np.ndarray, colors: np.ndarray) -> np.ndarray:
-    """Draws triangles with linear colours into an (H, W, 3) image, and returns it."""
+def _fill(
+    image: np.ndarray, triangles: np.ndarray, values: np.ndarray, colors_of: Callable[[np.ndarray], np.ndarray]
+) -> np.ndarray:
+    """Draws triangles with linear values, in the colours of these, into an (H, W, 3) image, and returns it."""
     extents = np.ptp(triangles, axis=1).prod(1) + 1.0
     # As many at a time as have some million pixels in their boxes.
     parts = np.flatnonzero(np.diff(np.cumsum(extents) // _PIXELS_AT_ONCE)) + 1
-    for some, their_colors in zip(np.split(triangles, parts), np.split(colors, parts)):
-        _fill_some(image, some, their_colors)
+    for some, their_values in zip(np.split(triangles, parts), np.split(values, parts)):
+        x, y, inner = _interpolated(image.shape[:2], some, their_values)
+        image[y, x] = colors_of(inner)
     return image
 
 
-def _fill_some(image: np.ndarray, triangles: np.ndarray, colors: np.ndarray) -> None:
-    height, width = image.shape[:2]
+def _interpolated(
+    shape: tuple[int, ...], triangles: np.ndarray, values: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(P,) columns and (P,) rows of the pixels in triangles, and (P, C) values there."""
+    height, width = shape
     low = np.maximum(np.floor(triangles.min(1)).astype(int), 0)
     high = np.minimum(np.ceil(triangles.max(1)).astype(int), (width - 1, height - 1))
     spans = np.maximum(high - low + 1, 0)
@@ -175,7 +230,7 @@ def _fill_some(image: np.ndarray, triangles: np.ndarray, colors: np.ndarray) -> 
     # A hair more than the triangle, so that no pixel between two neighbours stays black.
     inside = (second >= -1e-9) & (third >= -1e-9) & (second + third <= 1 + 1e-9)
     weights = np.stack((1 - second - third, second, third), 1)[inside]
-    image[y[inside], x[inside]] = (weights[:, :, None] * colors[owner[inside]]).sum(1)
+    return x[inside], y[inside], (weights[:, :, None] * values[owner[inside]]).sum(1)
 
 
 def _cross(p: np.ndarray, q: np.ndarray) -> np.ndarray:

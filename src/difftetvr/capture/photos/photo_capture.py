@@ -10,17 +10,18 @@ from typing import Literal
 import numpy as np
 import torch
 
+from difftetvr.capture.camera_set import CameraSet
 from difftetvr.capture.capture import Capture
 from difftetvr.capture.hull import silhouettes
 from difftetvr.capture.photos.bounds import hull_bounds, point_bounds, require_resolved, require_seen, surroundings_of
 from difftetvr.capture.photos.lens import make_camera
-from difftetvr.capture.photos.photo_load import Photos, fitting_downscale, load_photos, present_views
+from difftetvr.capture.photos.photo_load import Photos, fitting_downscale, load_photos, photo_cameras, present_views
 from difftetvr.capture.photos.photo_set import PhotoSet, read_json
 from difftetvr.capture.photos.readers.camera_list import CAMERAS_FORMAT, read_camera_list
 from difftetvr.capture.photos.readers.colmap import colmap_models, read_colmap
 from difftetvr.capture.photos.readers.foreign import known_export
 from difftetvr.capture.photos.readers.phone_apps import is_polycam, is_record3d, read_polycam, read_record3d
-from difftetvr.capture.photos.readers.tiny_nerf import is_tiny_nerf, read_tiny_nerf
+from difftetvr.capture.photos.readers.tiny_nerf import TinyNerf, is_tiny_nerf, read_tiny_nerf
 from difftetvr.capture.photos.readers.transforms import read_nerf_synthetic, read_transforms
 from difftetvr.capture.volumes.readers.table import is_volume_file
 from difftetvr.declared import require_declared
@@ -98,10 +99,7 @@ class PhotoCapture:
         kind = self.format or find_format(path)
         if kind == "tiny-nerf":
             return self._build_tiny_nerf(path)
-        photo_set = self._read(kind, path)
-        photo_set.views = present_views(photo_set, self.downscale)
-        given = torch.tensor([view.is_test for view in photo_set.views]) if photo_set.has_split else None
-        test = self._test_mask(given, len(photo_set.views), photo_set.name)
+        photo_set, test = self._present(kind, path)
         photos = load_photos(photo_set, self.downscale, self.keep_lens)
         bounds, surroundings = self._find_bounds(photo_set, photos, test)
         return Capture(
@@ -118,6 +116,27 @@ class PhotoCapture:
             surroundings=surroundings,
         )
 
+    def camera_set(self) -> CameraSet:
+        """The cameras that `build` finds, without the images: in a moment, however many and large these are.
+
+        Raises:
+            CaptureError: A file or a value is not valid.
+        """
+        self._check()
+        path = Path(self.path)
+        kind = self.format or find_format(path)
+        if kind == "tiny-nerf":
+            return self._read_tiny_nerf(path)[1]
+        photo_set, test = self._present(kind, path)
+        return CameraSet(photo_cameras(photo_set, self.downscale, self.keep_lens), test, photo_set.name)
+
+    def _present(self, kind: PhotoFormat, path: Path) -> tuple[PhotoSet, torch.Tensor]:
+        """What a reader finds, with those views alone whose images exist; and which of them are held out."""
+        photo_set = self._read(kind, path)
+        photo_set.views = present_views(photo_set, self.downscale)
+        given = torch.tensor([view.is_test for view in photo_set.views]) if photo_set.has_split else None
+        return photo_set, self._test_mask(given, len(photo_set.views), photo_set.name)
+
     @staticmethod
     def _read(kind: PhotoFormat, path: Path) -> PhotoSet:
         if not os.path.exists(path):
@@ -125,24 +144,27 @@ class PhotoCapture:
         return _READERS[kind](path)
 
     def _build_tiny_nerf(self, path: Path) -> Capture:
-        content = read_tiny_nerf(path, self.downscale)
-        cameras = [
-            make_camera(content.intrinsics, torch.from_numpy(pose).float(), f"view {index} of '{path}'")
-            for index, pose in enumerate(content.poses)
-        ]
-        test = self._test_mask(None, len(cameras), path.stem)
-        photos = Photos(cameras, content.images, content.alphas, None)
-        bounds, surroundings = self._find_bounds(PhotoSet(path.stem), photos, test)
+        content, views = self._read_tiny_nerf(path)
+        photos = Photos(views.cameras, content.images, content.alphas, None)
+        bounds, surroundings = self._find_bounds(PhotoSet(path.stem), photos, views.test)
         return Capture(
-            cameras,
+            views.cameras,
             content.images,
             content.alphas,
-            test,
+            views.test,
             bounds,
             path.stem,
             encoding="srgb",
             surroundings=surroundings,
         )
+
+    def _read_tiny_nerf(self, path: Path) -> tuple[TinyNerf, CameraSet]:
+        content = read_tiny_nerf(path, self.downscale)
+        cameras = [
+            make_camera(content.intrinsics, torch.from_numpy(pose).float(), f"view {index} of '{path}'")
+            for index, pose in enumerate(content.poses)
+        ]
+        return content, CameraSet(cameras, self._test_mask(None, len(cameras), path.stem), path.stem)
 
     def _check(self) -> None:
         if not 1 <= self.downscale <= _MOST_DOWNSCALE:

@@ -99,8 +99,8 @@ def load_photos(photo_set: PhotoSet, downscale: int, keep_lens: bool = False) ->
     plans = [_plan(view, downscale, keep_lens) for view in photo_set.views]
     _warn_of_16_bits(plans, photo_set)
     _warn_of_unknown(plans, photo_set)
-    sizes = _sizes([plan.seen for plan in plans], photo_set)
-    cameras = [_camera(plan, size) for plan, size in zip(plans, sizes, strict=True)]
+    cameras = _cameras(plans, photo_set)
+    sizes = [(camera.width, camera.height) for camera in cameras]
     channels = 3 + (0 if all(plan.view.mask is None and plan.known is None for plan in plans) else 1)
     pixels = sum(width * height for width, height in sizes)
     advice = "shrink them more with a larger downscale"
@@ -120,6 +120,25 @@ def load_photos(photo_set: PhotoSet, downscale: int, keep_lens: bool = False) ->
     if alphas is not None and all((alpha == 255).all() for alpha in alphas):
         alphas = None
     return Photos(cameras, _packed(images), None if alphas is None else _packed(alphas), _as_masks(valid))
+
+
+def photo_cameras(photo_set: PhotoSet, downscale: int, keep_lens: bool = False) -> list[Camera]:
+    """The cameras that `load_photos` finds, of which it takes no more than the headers of the images.
+
+    Args:
+        photo_set: As for `load_photos`, as all others.
+        downscale: Pixels of the original along x and y that become one.
+        keep_lens: Whether lenses are kept.
+
+    Raises:
+        CaptureError: An image has no header that can be read, or sizes do not fit.
+    """
+    return _cameras([_plan(view, downscale, keep_lens) for view in photo_set.views], photo_set)
+
+
+def _cameras(plans: Sequence[_Plan], photo_set: PhotoSet) -> list[Camera]:
+    sizes = _sizes([plan.seen for plan in plans], photo_set)
+    return [_camera(plan, size) for plan, size in zip(plans, sizes, strict=True)]
 
 
 def _loaded(plans: Sequence[_Plan]) -> Iterator[tuple[np.ndarray, np.ndarray | None]]:

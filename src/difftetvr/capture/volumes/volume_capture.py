@@ -11,6 +11,7 @@ from typing import Literal
 
 import torch
 
+from difftetvr.capture.camera_set import CameraSet
 from difftetvr.capture.capture import Capture
 from difftetvr.capture.orbit import DEFAULT_FOV_Y, fibonacci_orbit, random_orbit
 from difftetvr.capture.volumes.value_range import range_text
@@ -103,8 +104,7 @@ class VolumeCapture:
                 f"of it where values {range_text(volume.value_range)} stand for 0 to 1; change the one, the other "
                 "(value_range, --value-range) or the attenuation."
             )
-        name = self.path if self.path == TOOTH else Path(self.path).name.split(".")[0]
-        return Capture(cameras, images, alphas, test, volume.bounds, name, self.attenuation)
+        return Capture(cameras, images, alphas, test, volume.bounds, self.name, self.attenuation)
 
     def load_volume(self) -> tuple[Volume, TransferFunction]:
         """The volume and its transfer function.
@@ -136,6 +136,19 @@ class VolumeCapture:
             return random_orbit(self.views, center, self.radius, self.fov_y, self.width, self.height, self.seed)
         except CameraError as error:
             raise CaptureError(f"The views cannot be placed: {error}") from None
+
+    def camera_set(self) -> CameraSet:
+        """The views' cameras and which of them are held out, without the volume.
+
+        Raises:
+            CaptureError: A value is out of range.
+        """
+        return CameraSet(self.cameras(), self._test_mask(), self.name)
+
+    @property
+    def name(self) -> str:
+        """What to call the capture."""
+        return self.path if self.path == TOOTH else Path(self.path).name.split(".")[0]
 
     def _require_memory(self) -> None:
         for name in ("views", "width", "height"):

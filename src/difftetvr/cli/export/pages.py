@@ -21,11 +21,13 @@ class PageOptions:
     """What a page shows, and how it opens."""
 
     transfer_function: Path | None = _USUAL.transfer_function
-    """Colour and opacity of the scalar, .json or .xml; default: blue over white to red, the more opaque the greater."""
+    """Colour and opacity of the scalar, .json or .xml; default: the look that render
+    chooses."""
     value_range: tuple[float, float] | None = _USUAL.value_range
-    """Scalars at the transfer function's 0 and 1; default: the least and the greatest."""
-    attenuation: float = _USUAL.attenuation
-    """Density of opacity 1, where the mesh's longest side is 1."""
+    """Scalars at the transfer function's 0 and 1; default: the least and the greatest, but
+    for outliers."""
+    attenuation: float | None = _USUAL.attenuation
+    """Density of opacity 1, where the mesh's longest side is 1; default: 25 with a transfer function, else chosen."""
     background: Color = "black"
     """Behind the volume: black, white or linear R G B."""
     camera: Path | None = None
@@ -64,7 +66,12 @@ class PageOptions:
         if len(job.names) > 1:
             raise MeshError(f"A page shows one scalar, but {len(job.names)} are given by --scalar; choose one.")
         name = job.names[0] if job.names else None
-        options = ScalarOptions(name, self.transfer_function, self.value_range, self.attenuation)
+        options = ScalarOptions(
+            scalar=name,
+            transfer_function=self.transfer_function,
+            value_range=self.value_range,
+            attenuation=self.attenuation,
+        )
         shown = options.apply(job.data, job.model)
         given = next((n for n in _OF_SCALARS if getattr(self, n) != getattr(_USUAL, n)), None)
         if shown.name is None and given is not None:

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from difftetvr.cli.arguments import Groups
+from difftetvr.cli.drawing.scalars import SCALAR_GROUP, ScalarOptions, Shown
 from difftetvr.cli.options import TRUST_GROUPS, Color, MeshOptions, TrustOptions, color_of
-from difftetvr.cli.render import ScalarOptions, Shown
 from difftetvr.errors import CameraError, CaptureError, DiffTetError, FitError, counted
 from difftetvr.files import require_writable
 
@@ -74,7 +74,7 @@ class Viewpoint:
     groups: ClassVar[Groups] = {
         "Search": ("measure", "poses", "starts", "scouts", "iterations", "search-size"),
         "Orbit and pictures": ("center", "radius", "up", "fov", "width", "height", "background"),
-        "Scalars of a simulation": ("scalar", "transfer-function", "value-range", "attenuation"),
+        "Scalars of a simulation": SCALAR_GROUP,
         "How it is drawn": ("renderer", "split", "step", "device"),
         **TRUST_GROUPS,
     }

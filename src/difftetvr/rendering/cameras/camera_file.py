@@ -69,17 +69,31 @@ def load_camera(path: str | Path) -> Camera:
         raise CameraError(f"The camera '{path}' is not valid JSON; give a file that save_camera wrote.") from None
     if not isinstance(content, dict) or content.get("format") != CAMERA_FORMAT:
         raise CameraError(f"'{path}' does not have the format '{CAMERA_FORMAT}'; give a file that save_camera wrote.")
-    missing = [name for name in ("world_to_camera", *_NUMBERS, *_SIZES) if name not in content]
+    return camera_from(content, f"camera '{path}'")
+
+
+def camera_from(content: Any, name: str) -> Camera:
+    """A camera from what a file says of it.
+
+    Args:
+        content: ``world_to_camera`` and the numbers of the camera, by name.
+        name: What to call it in messages: camera 'best.json'.
+
+    Raises:
+        CameraError: One of these is missing or not valid.
+    """
+    needed = ("world_to_camera", *_NUMBERS, *_SIZES)
+    missing = [key for key in needed if not isinstance(content, dict) or key not in content]
     if missing:
-        raise CameraError(f"The camera '{path}' has no '{missing[0]}'; give a file that save_camera wrote.")
+        raise CameraError(f"The {name} has no '{missing[0]}'; give a file that save_camera wrote.")
     try:
         pose = torch.tensor(content["world_to_camera"], dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError, OverflowError):
-        raise CameraError(f"'world_to_camera' of the camera '{path}' is no matrix of numbers; correct it.") from None
+        raise CameraError(f"'world_to_camera' of the {name} is no matrix of numbers; correct it.") from None
     single = pose.float()
     if torch.equal(single.double(), pose):
         pose = single
     try:
-        return Camera(pose, *(content[name] for name in (*_NUMBERS, *_SIZES)))
+        return Camera(pose, *(content[key] for key in (*_NUMBERS, *_SIZES)))
     except CameraError as error:
-        raise CameraError(f"The camera '{path}' is not valid: {error}") from None
+        raise CameraError(f"The {name} is not valid: {error}") from None

@@ -1,0 +1,121 @@
+"""Axes around what is shown: its box with numbers along three edges."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from matplotlib.ticker import MaxNLocator
+
+from difftetvr.capture.viewing import Floats
+from difftetvr.rendering.cameras.pinhole import Camera
+from difftetvr.view.frames.color_bar import labels_of
+from difftetvr.view.frames.lettering import Layer
+
+ROOM = 0.12
+"""Share of a picture on each side that numbers take."""
+
+_NAMES = "xyz"
+_TICKS = 5
+_CLOSE = 2.2  # letters between two ticks, below which every second number is left out
+
+
+@dataclass(frozen=True, eq=False)
+class AxesBox:
+    """The box of what is shown, and what its numbers are.
+
+    Attributes:
+        bounds: (2, 3) lower and upper corner in world space.
+        lengths: (2, 3) coordinates that are written at these corners; None: those of world space.
+        unit: What they are told in; empty: not said.
+    """
+
+    bounds: torch.Tensor
+    lengths: torch.Tensor | None = None
+    unit: str = ""
+
+
+class ProjectedBox:
+    """A box as a camera sees it.
+
+    Args:
+        box: The box.
+        camera: From where it is seen.
+    """
+
+    def __init__(self, box: AxesBox, camera: Camera) -> None:
+        self._box = box
+        self._bounds = box.bounds.detach().double().cpu().numpy()
+        self._camera = camera
+        corners = np.array(list(itertools.product((0, 1), repeat=3)))
+        pixels, enlarged = self._seen(np.take_along_axis(self._bounds, corners, axis=0))
+        self.is_in_front = bool((enlarged > 0.0).all())
+        """Whether all of it lies in front of the camera; only then it can be drawn."""
+        self._center = pixels.mean(0)
+        eye = camera.position.detach().double().cpu().numpy()
+        # Whether the camera sees the outer side of a face, by its axis and its end.
+        self._faces_camera = np.stack([eye < self._bounds[0], eye > self._bounds[1]])
+
+    def draw_behind(self, layer: Layer) -> None:
+        """Draws the edges that lie behind the box's inside, or beside it."""
+        for axis, ends in self._edges():
+            if not all(self._faces_camera[end, other] for other, end in self._others(axis, ends)):
+                layer.line(self._line(axis, ends))
+
+    def draw_numbers(self, layer: Layer) -> None:
+        """Draws ticks and numbers along one edge of each direction, on the outline of the box."""
+        for axis in range(3):
+            outline = [
+                ends
+                for direction, ends in self._edges()
+                if direction == axis
+                and sum(self._faces_camera[end, other] for other, end in self._others(axis, ends)) == 1
+            ]
+            if outline:
+                # The lowest one, of upright ones the leftmost.
+                middles = np.array([self._line(axis, ends).mean(0) for ends in outline])
+                span = np.ptp(self._line(axis, outline[0]), axis=0)
+                best = middles[:, 0].argmin() if span[1] > span[0] else middles[:, 1].argmax()
+                self._draw_ticks(layer, axis, outline[int(best)])
+
+    def _draw_ticks(self, layer: Layer, axis: int, ends: tuple[int, int]) -> None:
+        line = self._line(axis, ends)
+        along = (line[1] - line[0]) / max(float(np.linalg.norm(line[1] - line[0])), 1e-9)
+        out = np.array([along[1], -along[0]])
+        out *= np.sign(out @ (line.mean(0) - self._center)) or 1.0
+        lengths = self._bounds if self._box.lengths is None else self._box.lengths.double().cpu().numpy()
+        low, high = lengths[:, axis].tolist()
+        values = [float(v) for v in MaxNLocator(_TICKS).tick_values(low, high) if low <= v <= high]
+        places = self._along(axis, ends, [(value - low) / (high - low) for value in values])
+        step = float(np.linalg.norm(np.diff(places, axis=0), axis=1).min()) if len(places) > 1 else np.inf
+        skip = 2 if step < _CLOSE * layer.letters else 1
+        for place, label in list(zip(places, labels_of(values, low, high), strict=True))[::skip]:
+            layer.line([place, place + 0.5 * layer.letters * out])
+            layer.text(place + 1.5 * layer.letters * out, label)
+        unit = f" ({self._box.unit})" if self._box.unit else ""
+        layer.text(line.mean(0) + 3.2 * layer.letters * out, f"{_NAMES[axis]}{unit}")
+
+    def _edges(self) -> list[tuple[int, tuple[int, int]]]:
+        """Direction of each edge, and at which ends of the other two axes it lies."""
+        return [(axis, (i, j)) for axis in range(3) for i in (0, 1) for j in (0, 1)]
+
+    def _others(self, axis: int, ends: tuple[int, int]) -> list[tuple[int, int]]:
+        return list(zip([other for other in range(3) if other != axis], ends, strict=True))
+
+    def _line(self, axis: int, ends: tuple[int, int]) -> Floats:
+        """(2, 2) pixels of the ends of an edge."""
+        return self._along(axis, ends, [0.0, 1.0])
+
+    def _along(self, axis: int, ends: tuple[int, int], shares: list[float]) -> Floats:
+        """(N, 2) pixels of points on an edge, told in shares of it."""
+        points = np.empty((len(shares), 3))
+        for other, end in self._others(axis, ends):
+            points[:, other] = self._bounds[end, other]
+        points[:, axis] = self._bounds[0, axis] + np.array(shares) * np.ptp(self._bounds[:, axis])
+        return self._seen(points)[0]
+
+    def _seen(self, points: Floats) -> tuple[Floats, Floats]:
+        pixels, enlarged = self._camera.project(torch.from_numpy(points))
+        return pixels.detach().cpu().numpy(), enlarged.detach().cpu().numpy()
