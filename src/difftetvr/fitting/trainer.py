@@ -142,12 +142,6 @@ class Trainer(AdaptiveRun):
         if self.iteration == self.config.steps:
             self._keep_free()
 
-    def glance(self) -> None:
-        """Notes the mean PSNR over a few held-out views, for the curves; decides nothing."""
-        seen = self.evaluate(self._glanced_views()).mean_psnr
-        if seen is not None:
-            self.history.evaluations.append((self.iteration, seen))
-
     def evaluate(self, views: list[int]) -> Evaluation:
         """Image quality of the reconstruction as it is now; each view is rendered by one of the processes.
 
@@ -157,6 +151,9 @@ class Trainer(AdaptiveRun):
         mesh, field, background = self.mesh, self.parameters.detached_field(), self.config.evaluation_background()
         own = [compared(mesh, field, self._truth, [view], background).row for view in self.processes.share(views)]
         return Evaluation.of_rows(self.processes.gathered(own, len(views), 3))
+
+    def _mean_psnr(self, views: list[int]) -> float | None:
+        return self.evaluate(views).mean_psnr
 
     def align(self, views: list[int]) -> None:
         """Moves held-out cameras to where their images fit best, where cameras are refined."""
@@ -264,21 +261,15 @@ class Trainer(AdaptiveRun):
         judgement, mesh = self._judgement(strategy.views), self.mesh
         unit = self.capture.density_unit
 
-        def model(face_steps: torch.Tensor | None) -> ImageModel:
-            steps = None if face_steps is None else torch.cat((face_steps[:, :3], unit * face_steps[:, 3:]), 1)
+        def model(steps: torch.Tensor | None) -> ImageModel:
+            in_units = None if steps is None else torch.cat((steps[:, :3], unit * steps[:, 3:]), 1)
             field, deterministic = self.parameters.detached_field(), self.config.deterministic
-            return judgement.model(mesh, field, deterministic, steps).with_density_unit(unit)
+            return judgement.model(mesh, field, deterministic, in_units).with_density_unit(unit)
 
         values = self.parameters.values(unit)
-        refinement = strategy.refine(
-            Situation(mesh, values, self._moment(), model, self._color_gradients, self._free_space)
-        )
-        if refinement is None:
-            return
+        situation = Situation(mesh, values, self._moment(), model, self._color_gradients, self._free_space)
         judges = judgement.some()
-        before = judges.error(mesh, self.parameters.detached_field())
-        self._apply(refinement)
-        self._record(refinement, mesh, (before, judges.error(self.mesh, self.parameters.detached_field())))
+        self._refine_by(strategy, situation, lambda: judges.error(self.mesh, self.parameters.detached_field()))
 
     def _judgement(self, views: int) -> Judgement:
         """What a refinement is judged on."""

@@ -28,13 +28,14 @@ class OutsideSupport:
     inside: torch.Tensor | None
 
     @staticmethod
-    def of(support: str, geometry: ProjectionGeometry) -> OutsideSupport:
+    def of(support: str, geometry: ProjectionGeometry, device: torch.device) -> OutsideSupport:
         """What a support leaves outside.
 
         Args:
             support: ``cylinder``, the largest one around the z axis in the box; or the file of a volume whose voxels
                 fill the box: the object may be where it exceeds its least value.
             geometry: Of the views; tells the box.
+            device: Where places are that are asked for.
 
         Raises:
             CaptureError: The volume cannot be read, or the z axis is not in the box.
@@ -45,11 +46,11 @@ class OutsideSupport:
                 raise CaptureError(
                     "The box to reconstruct does not hold the axis, so there is no cylinder around it; give a volume."
                 )
-            return OutsideSupport(geometry.bounds, None)
+            return OutsideSupport(geometry.bounds.to(device), None)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", CaptureWarning)
             values = Volume.load(support).values
-        return OutsideSupport(geometry.bounds, torch.from_numpy(values > 0).permute(2, 1, 0))
+        return OutsideSupport(geometry.bounds.to(device), torch.from_numpy(values > 0).permute(2, 1, 0).to(device))
 
     def contains(self, places: torch.Tensor) -> torch.Tensor:
         """(N,) bool, which of (N, 3) places are outside of the support."""
@@ -60,4 +61,4 @@ class OutsideSupport:
         counts = torch.tensor(self.inside.shape, device=places.device)
         # A place on the box's far side belongs to the last voxel.
         at = ((places - low) / (high - low) * counts).long().clamp(min=0).minimum(counts - 1)
-        return ~self.inside.to(places.device)[at[:, 0], at[:, 1], at[:, 2]]
+        return ~self.inside[at[:, 0], at[:, 1], at[:, 2]]

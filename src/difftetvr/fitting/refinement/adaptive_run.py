@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import torch
 
+from difftetvr.capture.free_space import FreeSpace
+from difftetvr.errors import FitError
 from difftetvr.fitting.positions import VertexOptimizer
 from difftetvr.fitting.records.checkpoint import Checkpoint
 from difftetvr.fitting.records.history import History, RefinementRecord
 from difftetvr.fitting.records.result import Progress
 from difftetvr.fitting.records.unread import Unread
-from difftetvr.fitting.refinement.strategy import Moment, Refinement, Strategy
+from difftetvr.fitting.refinement.strategy import EmptySpace, Model, Moment, Refinement, Situation, Strategy
 from difftetvr.mesh.changes.change import MeshChange
 from difftetvr.mesh.tetmesh import TetMesh
 
@@ -101,14 +104,52 @@ class AdaptiveRun:
             self.positions.carry(change)
         self._mesh = change.mesh
 
-    def _record(self, refinement: Refinement, before: TetMesh, errors: tuple[float, float]) -> None:
-        """Takes note of a refinement that has been made.
+    def glance(self) -> None:
+        """Notes how a few held-out views look, for the curves; decides nothing."""
+        views = self._glanced_views()
+        seen = self._mean_psnr(views) if views else None
+        if seen is not None:
+            self.history.evaluations.append((self.iteration, seen))
+
+    def _mean_psnr(self, views: list[int]) -> float | None:
+        """Mean PSNR in dB of some views as they are now; None where none of them tells it."""
+        raise NotImplementedError
+
+    def _situation(
+        self, values: torch.Tensor, model: Model, empty: EmptySpace | None = None, reach: float = math.inf
+    ) -> Situation:
+        """What a strategy decides upon where vertices have one value and no colours.
 
         Args:
-            refinement: What it was.
-            before: The mesh before it.
-            errors: Errors before and after it.
+            values: (V,) in units; in models it has the place of density.
+            model: See `Situation`.
+            empty: Where it stays 0; None: nowhere.
+            reach: Greatest change of it for which the models are believed.
         """
+        padded = torch.nn.functional.pad(values.detach()[:, None], (3, 0))
+        known = FreeSpace([], []) if empty is None else empty
+        return Situation(self.mesh, padded, self._moment(), model, _no_colors, known, reach)
+
+    def _refine_by(self, strategy: Strategy, situation: Situation, error: Callable[[], float]) -> None:
+        """Lets a strategy decide, does what it says, and takes note of it.
+
+        Args:
+            strategy: The strategy.
+            situation: What it decides upon.
+            error: Tells the error as it is.
+        """
+        refinement = strategy.refine(situation)
+        if refinement is None:
+            return
+        before = error()
+        self._apply(refinement)
+        self._record(refinement, situation.mesh, (before, error()))
+
+    def _apply(self, refinement: Refinement) -> None:
+        """Does what a refinement says to the mesh and all that is on it."""
+        raise NotImplementedError
+
+    def _record(self, refinement: Refinement, before: TetMesh, errors: tuple[float, float]) -> None:
         self.history.refinements.append(
             RefinementRecord(
                 iteration=self.iteration,
@@ -147,3 +188,7 @@ class AdaptiveRun:
         if self.positions:
             self.positions.restore({name.removeprefix(_POSITIONS): tensor for name, tensor in saved.tensors.items()})
         self.budget, self.iteration, self.history = saved.budget, saved.iteration, saved.history
+
+
+def _no_colors() -> torch.Tensor:
+    raise FitError("There are no colours here to refine by; refine by exchange or grow.")

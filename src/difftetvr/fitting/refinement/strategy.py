@@ -39,6 +39,14 @@ class Moment:
         return self.iteration / self.iterations
 
 
+class Model(Protocol):
+    """The quadratic models of an error, made when they are asked for; see `Situation`."""
+
+    def __call__(self, steps: torch.Tensor | None) -> ImageModel:
+        """The models; of faces along (F, 4) steps alone, where some are given."""
+        ...
+
+
 class EmptySpace(Protocol):
     """Space that is known to be empty."""
 
@@ -66,7 +74,7 @@ class Situation:
     mesh: TetMesh
     values: torch.Tensor
     moment: Moment
-    model: Callable[[torch.Tensor | None], ImageModel]
+    model: Model
     color_gradients: Callable[[], torch.Tensor]
     free_space: EmptySpace
     reach: float = math.inf

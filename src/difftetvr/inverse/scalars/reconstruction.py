@@ -9,7 +9,6 @@ from typing import Any
 import torch
 
 from difftetvr.capture.capture import Capture
-from difftetvr.capture.free_space import FreeSpace
 from difftetvr.capture.truth import BLACK, Truth
 from difftetvr.errors import FitError
 from difftetvr.fitting.beginning.requirements import resolve_device
@@ -19,7 +18,7 @@ from difftetvr.fitting.records.checkpoint import Checkpoint, describe_capture, r
 from difftetvr.fitting.records.evaluation import Evaluation, compared
 from difftetvr.fitting.records.history import History
 from difftetvr.fitting.records.unread import Unread
-from difftetvr.fitting.refinement import Refinement, Situation
+from difftetvr.fitting.refinement import Refinement
 from difftetvr.fitting.refinement.adaptive_run import AdaptiveRun
 from difftetvr.fitting.refinement.pixels import Judgement
 from difftetvr.inverse.scalars.config import ScalarConfig
@@ -120,12 +119,6 @@ class ScalarReconstruction(AdaptiveRun):
         self._unread.read_moves(self.history)
         self.iteration += 1
 
-    def glance(self) -> None:
-        """Notes the mean PSNR over a few held-out views, for the curves; decides nothing."""
-        seen = self.evaluate(self._glanced_views()).mean_psnr
-        if seen is not None:
-            self.history.evaluations.append((self.iteration, seen))
-
     def evaluate(self, views: list[int]) -> Evaluation:
         """Image quality of the reconstruction as it is now, over black.
 
@@ -133,6 +126,9 @@ class ScalarReconstruction(AdaptiveRun):
             views: Indices of the views to compare.
         """
         return compared(self.mesh, self.field(), self._truth, views, BLACK)
+
+    def _mean_psnr(self, views: list[int]) -> float | None:
+        return self.evaluate(views).mean_psnr
 
     def checkpoint(self) -> Checkpoint:
         """The state, to be saved."""
@@ -159,7 +155,8 @@ class ScalarReconstruction(AdaptiveRun):
                 come further than the options ask for.
         """
         checkpoint.config.require_same_run(config)
-        run = ScalarReconstruction(capture, function, config, attenuation, checkpoint.mesh())
+        mesh = checkpoint.mesh()
+        run = ScalarReconstruction(capture, function, config, attenuation, mesh, torch.zeros(mesh.num_vertices))
         require_same_capture(checkpoint.capture, run._description())
         run._go_on_from(checkpoint)
         run.scalars.restore(checkpoint.tensors)
@@ -244,16 +241,8 @@ class ScalarReconstruction(AdaptiveRun):
         def model(steps: torch.Tensor | None) -> ImageModel:
             return judgement.model(mesh, self.field(), self.config.deterministic, steps)
 
-        values = torch.nn.functional.pad(self.scalars.values.detach()[:, None], (3, 0))
-        # Nothing is known to be empty, and there are no colours.
-        situation = Situation(mesh, values, self._moment(), model, _no_colors, FreeSpace([], []), _REACH)
-        refinement = self.strategy.refine(situation)
-        if refinement is None:
-            return
-        judges = judgement.some()
-        before = judges.error(mesh, self.field())
-        self._apply(refinement)
-        self._record(refinement, mesh, (before, judges.error(self.mesh, self.field())))
+        situation, judges = self._situation(self.scalars.values, model, reach=_REACH), judgement.some()
+        self._refine_by(self.strategy, situation, lambda: judges.error(self.mesh, self.field()))
 
     def _apply(self, refinement: Refinement) -> None:
         for change in refinement.changes:
@@ -261,7 +250,3 @@ class ScalarReconstruction(AdaptiveRun):
             self._adopt(change)
         if refinement.surplus is not None:
             self.scalars.add(refinement.surplus[:, 3])
-
-
-def _no_colors() -> torch.Tensor:
-    raise FitError("A reconstruction of scalars has no colours to refine by; refine by exchange or grow.")

@@ -7,7 +7,6 @@ from typing import Any
 
 import torch
 
-from difftetvr.capture.free_space import FreeSpace
 from difftetvr.capture.projections.projection_capture import ProjectionCapture
 from difftetvr.capture.projections.support import OutsideSupport
 from difftetvr.errors import FitError
@@ -17,7 +16,7 @@ from difftetvr.fitting.processes import ALONE
 from difftetvr.fitting.records.checkpoint import Checkpoint
 from difftetvr.fitting.records.history import History
 from difftetvr.fitting.records.unread import Unread
-from difftetvr.fitting.refinement import Refinement, Situation, Strategy
+from difftetvr.fitting.refinement import Refinement, Strategy
 from difftetvr.fitting.refinement.adaptive_run import AdaptiveRun
 from difftetvr.inverse.tomography.alignment import Alignment
 from difftetvr.inverse.tomography.config import TomographyConfig
@@ -71,8 +70,7 @@ class Reconstruction(AdaptiveRun):
         self._mesh = (mesh or _grid(capture, config, self.strategy)).to(device=device)
         self.positions = VertexOptimizer(self._mesh, config.motion) if config.move else None
         self.densities = Densities(self._mesh, self.measurements.density_unit, config.rate, config.betas)
-        nothing = FreeSpace([], [])
-        self._outside = OutsideSupport.of(config.support, capture.geometry) if config.support else nothing
+        self._outside = OutsideSupport.of(config.support, capture.geometry, device) if config.support else None
         self._keep_free()
         shift = 0.0 if config.align == "none" else self.measurements.axis_shift()
         self.alignment = Alignment(config.align, capture.geometry.shape, device, shift)
@@ -130,13 +128,6 @@ class Reconstruction(AdaptiveRun):
         each = max(1, count // len(chosen))
         return [self._fixed(view, each, (float(random.random()), float(random.random()))) for view in chosen]
 
-    def glance(self) -> None:
-        """Notes the PSNR of line integrals of a few held-out views, for the curves; decides nothing."""
-        views = self._glanced_views()
-        if views:
-            score = self.score(views, _GLANCED_RAYS)
-            self.history.evaluations.append((self.iteration, score.mean_psnr))
-
     def score(self, views: list[int], pixels: int | None = None) -> ProjectionScore:
         """How well views are predicted.
 
@@ -146,6 +137,9 @@ class Reconstruction(AdaptiveRun):
         """
         parts = [(view, self._fixed(view, pixels or self.measurements.all_pixels)) for view in views]
         return score_views(self.mesh, self.densities.detached(), self.measurements.peak, parts)
+
+    def _mean_psnr(self, views: list[int]) -> float | None:
+        return self.score(views, _GLANCED_RAYS).mean_psnr
 
     def checkpoint(self) -> Checkpoint:
         """The state, to be saved."""
@@ -226,18 +220,11 @@ class Reconstruction(AdaptiveRun):
         def model(steps: torch.Tensor | None) -> ImageModel:
             return judgement.model(mesh, densities.detached(), densities.unit, steps)
 
-        values = torch.nn.functional.pad(densities.values.detach()[:, None], (3, 0))
-        situation = Situation(mesh, values, self._moment(), model, _no_colors, self._outside)
-        refinement = self.strategy.refine(situation)
-        if refinement is None:
-            return
-        judges = judgement.some()
-        before = judges.error(mesh, densities.detached())
-        self._apply(refinement)
-        self._record(refinement, mesh, (before, judges.error(self.mesh, densities.detached())))
+        situation, judges = self._situation(densities.values, model, self._outside), judgement.some()
+        self._refine_by(self.strategy, situation, lambda: judges.error(self.mesh, densities.detached()))
 
     def _keep_free(self) -> None:
-        if self.config.support:
+        if self._outside is not None:
             self.densities.keep_free(self._outside.contains(self.mesh.vertices))
 
     def _apply(self, refinement: Refinement) -> None:
@@ -247,10 +234,6 @@ class Reconstruction(AdaptiveRun):
         self._keep_free()
         if refinement.surplus is not None:
             self.densities.set(self.densities.values.detach() + refinement.surplus[:, 3].to(self.densities.values))
-
-
-def _no_colors() -> torch.Tensor:
-    raise FitError("A tomographic reconstruction has no colours to refine by; refine by exchange or grow.")
 
 
 def _grid(capture: ProjectionCapture, config: TomographyConfig, strategy: Strategy | None) -> TetMesh:
