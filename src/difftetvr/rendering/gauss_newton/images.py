@@ -18,7 +18,7 @@ from difftetvr.rendering.kernels.forward import render_forward
 from difftetvr.rendering.kernels.hats.kernel import STEP_RECORD, HatSpace
 from difftetvr.rendering.kernels.hats.light import RECORD, HatImage, hat_records
 from difftetvr.rendering.kernels.hats.scalars import RECORD as SCALAR_RECORD
-from difftetvr.rendering.kernels.hats.scalars import ScalarHatImage, scalar_hat_records
+from difftetvr.rendering.kernels.hats.scalars import scalar_hat_records
 from difftetvr.rendering.preparation import PreparedView, ViewOptions, prepare_view
 from difftetvr.rendering.rays import Rays, RaySource
 from difftetvr.rendering.scalar_field import ScalarField
@@ -114,18 +114,16 @@ class _LightModels:
         backend = self.view.task.backend
         widths = [self.width, self.width, self.width if self.face_steps is None else STEP_RECORD]
         space = HatSpace.of(mesh, self.view.upload.order, widths)
-        found = self.gather(tracer, self.asked(*(backend.floats(part) for part in image)), space, in_order)
+        steps = None if self.face_steps is None else backend.floats(self.steps_of(self.face_steps))
+        color, gradient = (backend.floats(part) for part in image)
+        found = self.gather(tracer, HatImage(color, gradient, steps), space, in_order)
         counts = (mesh.num_vertices, mesh.topology.edges.shape[0], mesh.topology.faces.shape[0])
         arrays = zip((found.vertices, found.edges, found.faces), widths, counts, strict=True)
         return [backend.tensor(array, -1, width)[:count] for array, width, count in arrays]
 
-    def asked(self, color: Any, gradient: Any) -> Any:
-        """What the kernel reads, from flat arrays of radiance and of the derivative of the loss by it."""
-        steps = None
-        if self.face_steps is not None:
-            in_units = torch.cat((self.face_steps[:, :3], self.face_steps[:, 3:] * self.view.unit), 1)
-            steps = self.view.task.backend.floats(in_units)
-        return HatImage(color, gradient, steps)
+    def steps_of(self, face_steps: torch.Tensor) -> torch.Tensor:
+        """Steps of faces as kernels read them, from (F, 4)."""
+        return torch.cat((face_steps[:, :3], face_steps[:, 3:] * self.view.unit), 1)
 
     def models(self, records: torch.Tensor, curvature: float) -> HatDerivatives:
         """Quadratic models from records.
@@ -145,11 +143,8 @@ class _ScalarModels(_LightModels):
     width = SCALAR_RECORD
     gather = staticmethod(scalar_hat_records)
 
-    def asked(self, color: Any, gradient: Any) -> Any:
-        steps = None
-        if self.face_steps is not None:
-            steps = self.view.task.backend.floats(self.face_steps[:, 3].contiguous())
-        return ScalarHatImage(color, gradient, steps)
+    def steps_of(self, face_steps: torch.Tensor) -> torch.Tensor:
+        return face_steps[:, 3].contiguous()
 
     def models(self, records: torch.Tensor, curvature: float) -> HatDerivatives:
         return HatDerivatives.of_density(records, curvature)

@@ -36,7 +36,7 @@ class HatImage:
     Attributes:
         color: (H, W, 3) radiance over the background.
         gradient: (H, W, 3) derivative of the loss with respect to it.
-        face_steps: (F, 4) the one step that is looked at of each face; None for all.
+        face_steps: (F, 4) the one step that is looked at of each face, or (F,) of hats of scalars; None for all.
     """
 
     color: Any
@@ -56,10 +56,29 @@ def hat_records(tracer: Tracer, image: HatImage, space: HatSpace, in_order: bool
     return gathered_records(_LightHats, tracer, image, space, in_order)
 
 
-class _LightHats(HatKernel):
-    """Responses of radiance: B to one unit of colour, and (D_r, D_g, D_b) to one unit of density."""
+def pass_piece(
+    length: Any, density: Any, color: list[Any], light: tuple[Any, list[Any]]
+) -> tuple[Any, list[Any], tuple[Any, list[Any]]]:
+    """Pass a piece of constant density and colour.
 
-    slots = 4
+    Args:
+        length, density, color: Of the piece.
+        light: Transmittance up to it, and radiance from there on.
+
+    Returns:
+        Responses of the radiance to one unit of its colour, and to one of its density; and the light behind it.
+    """
+    transmittance, rest = light
+    seen = transmittance * (1.0 - dr.exp(-density * length))
+    transmittance = transmittance - seen
+    rest = [dr.fma(-seen, c, r) for c, r in zip(color, rest, strict=True)]
+    # More density here shows more of this piece and dims all that lies behind it.
+    dims = [length * dr.fma(transmittance, c, -r) for c, r in zip(color, rest, strict=True)]
+    return seen, dims, (transmittance, rest)
+
+
+class ImageHats(HatKernel):
+    """What hats of all kinds do that radiance responds to."""
 
     def __init__(self, tracer: Tracer, rays: Lanes, tables: HatTables, records: HatSums, image: HatImage) -> None:
         super().__init__(tracer, rays, tables, records)
@@ -70,21 +89,23 @@ class _LightHats(HatKernel):
         )
 
     def light(self) -> list[Any]:
+        """Radiance of the whole rays."""
         return self.color
+
+
+class _LightHats(ImageHats):
+    """Responses of radiance: B to one unit of colour, and (D_r, D_g, D_b) to one unit of density."""
+
+    slots = 4
 
     def sample(self, entry: list[Any], leaving: list[Any], ray: HatRay) -> tuple[list[Response], Any, list[Any]]:
         length = dr.fmax(leaving[0] - entry[0], 0.0)
         piece = length * (1.0 / SAMPLES)
-        transmittance, rest = ray.transmittance, ray.rest
+        light = ray.transmittance, ray.rest
         responses = []
         for x in PLACES:
             density, *color = (dr.fma(x, v1 - v0, v0) for v0, v1 in zip(entry[1:], leaving[1:], strict=True))
-            opacity = 1.0 - dr.exp(-density * piece)
-            seen = transmittance * opacity
-            transmittance = transmittance - seen
-            rest = [dr.fma(-seen, c, r) for c, r in zip(color, rest, strict=True)]
-            # More density here shows more of this piece and dims all that lies behind it.
-            dims = [piece * dr.fma(transmittance, c, -r) for c, r in zip(color, rest, strict=True)]
+            seen, dims, light = pass_piece(piece, density, color, light)
             responses.append([seen, *dims])
         # The state goes on exactly: errors of the pieces do not add up along the ray.
         w0, w1, through = self.view.optics.weights(length, entry[1], leaving[1])

@@ -6,7 +6,6 @@ counts as linear, with the slope between its values at the piece's ends: knots w
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -14,7 +13,6 @@ import drjit as dr
 from difftetvr.rendering.kernels.hats.kernel import (
     PLACES,
     SAMPLES,
-    HatKernel,
     HatRay,
     HatRecords,
     HatSpace,
@@ -22,6 +20,7 @@ from difftetvr.rendering.kernels.hats.kernel import (
     Response,
     gathered_records,
 )
+from difftetvr.rendering.kernels.hats.light import HatImage, ImageHats, pass_piece
 from difftetvr.rendering.kernels.hats.tables import HatTables
 from difftetvr.rendering.traversal.crossing import Tracer
 from difftetvr.rendering.traversal.rays import Lanes
@@ -34,22 +33,7 @@ _NARROWEST = 1.0 / 512.0
 """Half of the least range of scalars that a slope is taken over: rounding decides that of a narrower one."""
 
 
-@dataclass
-class ScalarHatImage:
-    """What the kernel reads, flat.
-
-    Attributes:
-        color: (H, W, 3) radiance over the background.
-        gradient: (H, W, 3) derivative of the loss with respect to it.
-        face_steps: (F,) the one step of the scalar that is looked at of each face; None for all.
-    """
-
-    color: Any
-    gradient: Any
-    face_steps: Any | None = None
-
-
-def scalar_hat_records(tracer: Tracer, image: ScalarHatImage, space: HatSpace, in_order: bool = False) -> HatRecords:
+def scalar_hat_records(tracer: Tracer, image: HatImage, space: HatSpace, in_order: bool = False) -> HatRecords:
     """Sums over the rays of a view for every vertex, edge and face; of faces those of their steps, if there are any.
 
     Args:
@@ -61,38 +45,26 @@ def scalar_hat_records(tracer: Tracer, image: ScalarHatImage, space: HatSpace, i
     return gathered_records(_ScalarHats, tracer, image, space, in_order)
 
 
-class _ScalarHats(HatKernel):
+class _ScalarHats(ImageHats):
     """Responses of radiance: (D_r, D_g, D_b) to one unit of the scalar."""
 
     slots = 3
 
-    def __init__(self, tracer: Tracer, rays: Lanes, tables: HatTables, records: HatSums, image: ScalarHatImage) -> None:
-        super().__init__(tracer, rays, tables, records)
+    def __init__(self, tracer: Tracer, rays: Lanes, tables: HatTables, records: HatSums, image: HatImage) -> None:
+        super().__init__(tracer, rays, tables, records, image)
         self.transfer: Any = tracer.view.transfer
-        self.face_steps, self.has_steps = image.face_steps, image.face_steps is not None
-        self.color, self.gradient = (
-            [dr.gather(self.view.backend.Float, array, 3 * rays.pixel + k, rays.valid) for k in range(3)]
-            for array in (image.color, image.gradient)
-        )
-
-    def light(self) -> list[Any]:
-        return self.color
 
     def sample(self, entry: list[Any], leaving: list[Any], ray: HatRay) -> tuple[list[Response], Any, list[Any]]:
         length = dr.fmax(leaving[0] - entry[0], 0.0) * (1.0 / SAMPLES)
         half = dr.fmax(dr.abs(leaving[1] - entry[1]) * (0.5 / SAMPLES), _NARROWEST)
-        transmittance, rest = ray.transmittance, ray.rest
+        light = ray.transmittance, ray.rest
         responses = []
         for x in PLACES:
             middle = dr.fma(x, leaving[1] - entry[1], entry[1])
             low, high = (self.transfer.at(middle + sign * half) for sign in (-1.0, 1.0))
             density, *color = (0.5 * (a + b) for a, b in zip(low, high, strict=True))
             slope = [(b - a) / (2.0 * half) for a, b in zip(low, high, strict=True)]
-            seen = transmittance * (1.0 - dr.exp(-density * length))
-            transmittance = transmittance - seen
-            rest = [dr.fma(-seen, c, r) for c, r in zip(color, rest, strict=True)]
-            # More density here shows more of this piece and dims all that lies behind it.
-            dims = [length * dr.fma(transmittance, c, -r) for c, r in zip(color, rest, strict=True)]
+            seen, dims, light = pass_piece(length, density, color, light)
             responses.append([dr.fma(seen, s, slope[0] * d) for s, d in zip(slope[1:], dims, strict=True)])
         return responses, *self._behind(entry, leaving, ray)
 
