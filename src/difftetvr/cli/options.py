@@ -32,6 +32,9 @@ if TYPE_CHECKING:
 # Half an hour on two cores; beyond, a reconstruction from photographs takes hours there.
 _LONGEST_SIDE, _LONGEST_SIDE_ON_CUDA = 240, 1600
 
+# Of volumes that may say something of images, too.
+_OF_VOLUMES = ("transfer_function", "shape", "dtype", "spacing", "value_range", "attenuation")
+
 Output = Annotated[Path, arg(aliases=["-o"])]
 
 Color = Literal["black", "white"] | tuple[float, float, float]
@@ -104,6 +107,17 @@ class CaptureOptions:
     test_every: int | None = None
     """One of so many views is held out; 0: none."""
 
+    def for_images(self, name: str) -> CaptureOptions:
+        """These options where those of volumes say what else is known of images, for which there is nothing to render.
+
+        Args:
+            name: Of the capture; a volume keeps its options.
+        """
+        if is_volume(name):
+            return self
+        unused: dict[str, Any] = dict.fromkeys(_OF_VOLUMES)
+        return dataclasses.replace(self, **unused)
+
     def sized_for(self, name: str, device: str | None, console: Console) -> CaptureOptions:
         """These options; where they leave the size of photographs open, with one that suits a device.
 
@@ -153,6 +167,13 @@ class CaptureOptions:
 
         with saying(console), waiting(console, f"Reading {name}"):
             return summarise(name, self.shape, self.dtype, self.spacing, self.value_range)
+
+
+def is_volume(name: str | Path) -> bool:
+    """Whether a name is that of the built-in scan or of a volume's file."""
+    from difftetvr.capture import TOOTH, is_volume_file
+
+    return str(name) == TOOTH or is_volume_file(name)
 
 
 @contextlib.contextmanager

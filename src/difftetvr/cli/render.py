@@ -13,7 +13,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from difftetvr.cli.arguments import Groups
 from difftetvr.cli.drawing.cameras import CAMERA_GROUPS, CameraOptions, Place, Shots
 from difftetvr.cli.drawing.scalars import SCALAR_GROUP, ScalarOptions, Shown
-from difftetvr.cli.options import TRUST_GROUPS, Color, MeshOptions, TrustOptions, VolumeOptions, color_of
+from difftetvr.cli.options import TRUST_GROUPS, Color, MeshOptions, TrustOptions, VolumeOptions, color_of, is_volume
 from difftetvr.errors import CaptureError, DiffTetError, counted
 from difftetvr.files import require_writable
 
@@ -89,13 +89,11 @@ class Render:
 
     def run(self, console: Console) -> None:
         """Renders, and writes the picture or the film."""
-        from difftetvr.capture import TOOTH, is_volume_file
         from difftetvr.fitting.beginning.requirements import resolve_device
         from difftetvr.rendering import OrderWarning
 
         self._require_valid()
-        is_volume = str(self.model) == TOOTH or is_volume_file(self.model)
-        data = None if is_volume else self.mesh.load(self.model, console)
+        data = None if is_volume(self.model) else self.mesh.load(self.model, console)
         place, device = Place(self.model, self.view_from, console), resolve_device(self.device)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", OrderWarning)

@@ -162,9 +162,7 @@ class FitConfig(Schedule):
 
     def __post_init__(self) -> None:
         require_declared(self, FitError, "option ")
-        for name, (least, most) in _RANGES.items():
-            value = getattr(self, name)
-            require(value is None or least <= value <= most, name, value, f"at least {least} and at most {most}")
+        self._require_counts(_RANGES)
         for name in ("rate", "final_rate", "harmonics_rate", "density_rate", "pace"):
             value = getattr(self, name)
             require(value is None or _positive(value), name, value, "greater than 0 and finite")

@@ -73,6 +73,19 @@ class RunOptions:
         """Number of optimisation steps."""
         raise NotImplementedError
 
+    def _require_counts(self, ranges: dict[str, tuple[int, int]]) -> None:
+        """Checks options that count something, where they are not left open.
+
+        Args:
+            ranges: Least and greatest value by name.
+
+        Raises:
+            FitError: One is out of range.
+        """
+        for name, (least, most) in ranges.items():
+            value = getattr(self, name)
+            require(value is None or least <= value <= most, name, value, f"at least {least} and at most {most}")
+
     def require_same_run(self, other: RunOptions) -> None:
         """Checks that ``other`` would take the same steps as these options of a saved run, were it of the same length.
 

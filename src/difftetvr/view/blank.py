@@ -8,10 +8,13 @@ import numpy as np
 import torch
 
 from difftetvr.capture.volumes.value_range import range_text
+from difftetvr.errors import MeshError
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.rendering import Camera, ScalarField
 from difftetvr.rendering.api import RenderedImage
 from difftetvr.rendering.inspection import inspect_rays
+
+_LEAST_SIZE, _MOST_SIZE = 1e-150, 1e150  # of meshes, so that squares of lengths are numbers
 
 # What would be stored as 0 in every picture of 8 bits.
 _LEAST_SEEN = 0.5 / 255.0
@@ -88,3 +91,17 @@ def _of_place(mesh: TetMesh, camera: Camera, renderer: str, clip_plane: Sequence
 
 def _is_met(mesh: TetMesh, camera: Camera, renderer: str, clip_plane: Sequence[float] | None) -> bool:
     return bool(inspect_rays(mesh, camera, renderer, clip_plane).depth_complexity.any())
+
+
+def require_drawable(size: float, what: str) -> None:
+    """Checks that pictures of a mesh can be computed at all.
+
+    Args:
+        size: Its longest side.
+        what: What to call it.
+
+    Raises:
+        MeshError: It is too small or too large.
+    """
+    if not _LEAST_SIZE < size < _MOST_SIZE:
+        raise MeshError(f"{what} is {size:.3g} across, of which no picture can be computed; scale its positions.")

@@ -11,7 +11,7 @@ from tyro.conf import OmitArgPrefixes, arg
 
 from difftetvr.cli.options import saying
 from difftetvr.cli.saved import SavedRun, run_behind, saved_beside
-from difftetvr.errors import CameraError, CaptureError, DiffTetError, MeshError, counted
+from difftetvr.errors import CameraError, CaptureError, DiffTetError, counted
 
 if TYPE_CHECKING:
     import torch
@@ -31,7 +31,6 @@ _DIRECTION = (0.55, -1.0, 0.55)
 _UP, _FOV, _SIZE, _FRAMES, _FPS = (0.0, 0.0, 1.0), 53.13, 512, 120, 24.0
 _FILLED = 0.94  # of the picture, by the box of what is shown
 _TURNS, _HALVINGS = 72, 50
-_LEAST_SIZE, _MOST_SIZE = 1e-150, 1e150  # of meshes, so that squares of lengths are numbers
 _MOST_FRAMES = 100_000
 
 
@@ -303,13 +302,11 @@ class Place:
         import torch
 
         from difftetvr.rendering.cameras.pinhole import Camera
+        from difftetvr.view.blank import require_drawable
 
         options = self._options
         size = float((bounds[1] - bounds[0]).max())
-        if not _LEAST_SIZE < size < _MOST_SIZE:
-            raise MeshError(
-                f"{self._model} is {size:.3g} across, of which no picture can be computed; scale its positions."
-            )
+        require_drawable(size, str(self._model))
         width, height = (_SIZE if pixels is None else pixels for pixels in (options.width, options.height))
         up, fov_y = options.up or _UP, math.radians(_FOV if options.fov is None else options.fov)
         target = torch.tensor(options.target, dtype=torch.float64) if options.target else bounds.mean(0)

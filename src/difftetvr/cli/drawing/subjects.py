@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import torch
 
@@ -12,10 +11,6 @@ from difftetvr.errors import CaptureError
 from difftetvr.rendering import Camera, RenderedImage, render, render_shading
 from difftetvr.view.blank import why_blank
 from difftetvr.view.frames import AxesBox
-
-if TYPE_CHECKING:
-    from difftetvr.optics.transfer_function import TransferFunction
-    from difftetvr.view.frames import ColorScale
 
 Color3 = tuple[float, float, float]
 
@@ -120,12 +115,6 @@ def over(image: RenderedImage, background: Color3) -> RenderedImage:
     """An image that was rendered over black, over another background."""
     behind = torch.tensor(background).to(image.color)
     return replace(image, color=image.color + (1.0 - image.alpha[..., None]) * behind)
-
-
-def function_of(subject: MeshSubject | VolumeSubject) -> TransferFunction | None:
-    """The transfer function that a subject is seen through; None: color and density."""
-    scale: ColorScale | None = subject.scale
-    return None if scale is None else scale.transfer_function
 
 
 def _over_shoulder(camera: Camera) -> Color3:

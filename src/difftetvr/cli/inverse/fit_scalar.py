@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import dataclasses
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, get_args
+from typing import TYPE_CHECKING, Annotated, ClassVar, get_args
 
 import tyro
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from difftetvr.cli.arguments import Groups
 from difftetvr.cli.inverse.run_command import Begun, RunCommand
-from difftetvr.cli.options import CAPTURE_GROUPS, CaptureOptions, TrustOptions
+from difftetvr.cli.options import CAPTURE_GROUPS, CaptureOptions, TrustOptions, is_volume
 from difftetvr.cli.saved import folder_to_resume, goes_on_with, saved_options
 from difftetvr.errors import FitError, counted
 from difftetvr.fitting.records.folder import RunFolder
@@ -27,7 +26,6 @@ if TYPE_CHECKING:
     from difftetvr.mesh import TetMesh
 
 _UNKNOWN = "--unknown"
-_OF_VOLUMES = ("transfer_function", "shape", "dtype", "spacing", "value_range", "attenuation")
 
 
 @dataclass(frozen=True)
@@ -85,14 +83,11 @@ class FitScalar(RunCommand):
 
         views_of = self.views_of.sized_for(self.capture, self.config.device, console)
         images = self._images(views_of, console)
-        if checkpoint is None or not checkpoint.exists():
-            steps = self.config.color_steps
-            if steps:
-                console.print(f"Colours and densities first, {counted(steps, 'iteration')}", highlight=False)
-            with ProgressDisplay(console) as display:
-                run = prepare(images, self.config, None, None, display)
-        else:
-            run = prepare(images, self.config, None, checkpoint)
+        steps = self.config.color_steps
+        if steps and not (checkpoint is not None and checkpoint.exists()):
+            console.print(f"Colours and densities first, {counted(steps, 'iteration')}", highlight=False)
+        with ProgressDisplay(console) as display:
+            run = prepare(images, self.config, None, checkpoint, display)
 
         def report(folder: RunFolder, result: ScalarResult) -> list[str]:
             write_scalar_report(folder, result, images.capture)
@@ -130,23 +125,18 @@ class FitScalar(RunCommand):
 
     def _images(self, views_of: CaptureOptions, console: Console) -> ScalarImages:
         """The images, and the function that they are seen through, as far as it is known."""
-        from difftetvr.capture.volumes.volume import is_volume_file
         from difftetvr.capture.volumes.volume_capture import TOOTH, VolumeCapture
         from difftetvr.inverse.scalars.loop import ScalarImages
         from difftetvr.optics.transfer_function import TransferFunction
 
-        path, is_volume = views_of.transfer_function, self.capture == TOOTH or is_volume_file(self.capture)
+        path, attenuation = views_of.transfer_function, views_of.attenuation
         function = TransferFunction.load(path) if path is not None else None
         if self.capture == TOOTH and function is None:
             _, function = VolumeCapture().load_volume()
-        if self.config.unknown == "both" and is_volume:
-            function = None  # it made the views, and is what is looked for
-        if is_volume:
-            return ScalarImages(views_of.load(self.capture, console), function)
-        # They are of the function here, not of a volume whose views were to be rendered.
-        unused: dict[str, Any] = dict.fromkeys(_OF_VOLUMES)
-        capture = dataclasses.replace(views_of, **unused).load(self.capture, console)
-        attenuation = views_of.attenuation
+        capture = views_of.for_images(self.capture).load(self.capture, console)
+        if is_volume(self.capture):
+            # Where both are looked for, the function has made the views, and is not known.
+            return ScalarImages(capture, None if self.config.unknown == "both" else function)
         if attenuation is not None:
             attenuation /= float((capture.bounds[1] - capture.bounds[0]).max())
         return ScalarImages(capture, function, attenuation)

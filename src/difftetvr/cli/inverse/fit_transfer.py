@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
 import shlex
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from difftetvr.cli.arguments import Groups
 from difftetvr.cli.inverse.viewpoint import make_folder
-from difftetvr.cli.options import CAPTURE_GROUPS, CaptureOptions, MeshOptions, TrustOptions
+from difftetvr.cli.options import CAPTURE_GROUPS, CaptureOptions, MeshOptions, TrustOptions, is_volume
 from difftetvr.errors import CaptureError, FitError, counted
 from difftetvr.files import require_writable
 
@@ -28,7 +27,6 @@ if TYPE_CHECKING:
     from difftetvr.mesh.field import Location
 
 _FILES = ("transfer_function.json", "start.json", "report.png", "metrics.json", "config.json")
-_OF_VOLUMES = ("transfer_function", "shape", "dtype", "spacing", "value_range", "attenuation")
 _LINE_SECONDS = 5.0
 _SATURATED = 0.99  # opacities above are as great as the attenuation lets them be
 
@@ -129,13 +127,13 @@ class FitTransfer:
         _print_summary(console, result, self.output)
 
     def _known(self, console: Console) -> Known:
-        from difftetvr.capture.volumes.volume import Volume, is_volume_file
+        from difftetvr.capture.volumes.volume import Volume
         from difftetvr.capture.volumes.volume_capture import TOOTH, VolumeCapture
         from difftetvr.inverse.transfer.volumes import volume_on_grid
         from difftetvr.mesh.io import missing_note, scalar_of
 
         options = self.views_of
-        if self.scalars == TOOTH or is_volume_file(self.scalars):
+        if is_volume(self.scalars):
             if self.scalars == TOOTH:
                 volume, _ = VolumeCapture(spacing=options.spacing, value_range=options.value_range).load_volume()
             else:
@@ -170,14 +168,7 @@ class FitTransfer:
         )
 
     def _capture(self, console: Console) -> Capture:
-        from difftetvr.capture.volumes.volume import is_volume_file
-        from difftetvr.capture.volumes.volume_capture import TOOTH
-
-        options = self.views_of
-        if self.images != TOOTH and not is_volume_file(self.images):
-            # They are of the scalars.
-            unused: dict[str, Any] = dict.fromkeys(_OF_VOLUMES)
-            options = dataclasses.replace(options, **unused)
+        options = self.views_of.for_images(self.images)
         return options.sized_for(self.images, self.device, console).load(self.images, console)
 
     def _require_free(self) -> Path:

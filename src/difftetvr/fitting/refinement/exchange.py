@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Literal, TypeVar
 
 from difftetvr.fitting.options import LARGEST_COUNT, OptionGroup
 from difftetvr.fitting.refinement.strategy import Moment, Refinement, Situation
 
+_Own = TypeVar("_Own", bound="Exchange")
+
 _LEAST_ROUNDS, _ITERATIONS_PER_ROUND = 40, 60
+_ITERATIONS_TO_SETTLE = 20
 
 
 @dataclass(frozen=True)
@@ -53,6 +56,15 @@ class Exchange(OptionGroup):
         self._require(0 < self.initial <= 1, "initial", "greater than 0 and at most 1")
         for name in ("until", "start", "long", "min_quality"):
             self._require(0 <= getattr(self, name) <= 1, name, "between 0 and 1")
+
+    def settling(self: _Own, iterations: int) -> _Own:
+        """The same with so many rounds, where that is left open, that values which models are true of can settle.
+
+        Args:
+            iterations: Of the run.
+        """
+        rounds = max(1, min(_LEAST_ROUNDS, iterations // _ITERATIONS_TO_SETTLE))
+        return replace(self, rounds=self.rounds or rounds)
 
     def initial_cells(self, budget: int) -> int:
         """See `Strategy.initial_cells`."""

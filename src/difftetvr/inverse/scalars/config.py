@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal, get_args
@@ -23,8 +22,6 @@ Refine = Literal["exchange", "grow", "none"]
 
 _START = 0.1
 """Part of their best surplus that new vertices start with: models are true of small steps."""
-
-_ROUNDS, _ITERATIONS_PER_ROUND = 40, 20
 
 _RANGES = {
     "cells": (1, MAX_CELLS),
@@ -91,9 +88,7 @@ class ScalarConfig(Schedule):
 
     def __post_init__(self) -> None:
         require_declared(self, FitError, "option ")
-        for name, (least, most) in _RANGES.items():
-            value = getattr(self, name)
-            require(value is None or least <= value <= most, name, value, f"at least {least} and at most {most}")
+        self._require_counts(_RANGES)
         for name in ("rate", "final_rate", "function_rate"):
             value = getattr(self, name)
             require(value > 0 and math.isfinite(value), name, value, "greater than 0 and finite")
@@ -123,7 +118,7 @@ class ScalarConfig(Schedule):
         if self.refine == "none":
             return None
         chosen: Exchange = getattr(self, self.refine)
-        return dataclasses.replace(chosen, rounds=chosen.rounds or _rounds(self.iterations))
+        return chosen.settling(self.steps)
 
     def of_field(self) -> FitConfig:
         """Options of a fit of colours and densities that the scalars begin with."""
@@ -139,10 +134,6 @@ class ScalarConfig(Schedule):
             deterministic=self.deterministic,
             device=self.device,
             evaluate_every=0,
-            exchange=Exchange(rounds=_rounds(steps)),
-            grow=Grow(rounds=_rounds(steps)),
+            exchange=Exchange().settling(steps),
+            grow=Grow().settling(steps),
         )
-
-
-def _rounds(iterations: int) -> int:
-    return max(1, min(_ROUNDS, iterations // _ITERATIONS_PER_ROUND))

@@ -178,21 +178,16 @@ class ScalarReconstruction(AdaptiveRun):
         """Gradients of the mean squared error of some views; means of the loss and of the error."""
         views = [self._train_views[k] for k in self.config.views_at(self.iteration, len(self._train_views))]
         self.scalars.zero_grad()
-        # The views' gradients meet at the function's numbers, behind which there is one graph.
-        function = self._function if self.knots is None else self.knots.function()
-        parts = (function.scalar, function.opacity, function.color)
-        scalar, opacity, color = leaves = [part.detach().requires_grad_(self.knots is not None) for part in parts]
-        seen = self._seen(self.scalars.values, TransferFunction(scalar, opacity, color))
+        function, hand_on = (self._function, None) if self.knots is None else self.knots.opened()
+        seen = self._seen(self.scalars.values, function)
         total = torch.zeros((), dtype=torch.float64, device=self._truth.device)
         for view in views:
             error = self._error(mesh, seen, view) / len(views)
             error.backward()
             total += error.detach()
-        if self.knots is not None:
+        if self.knots is not None and hand_on is not None:
             self.knots.zero_grad()
-            torch.autograd.backward(
-                parts, [torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for leaf in leaves]
-            )
+            hand_on(None)
         return [total, total]
 
     def _error(self, mesh: TetMesh, field: ScalarField, view: int) -> torch.Tensor:

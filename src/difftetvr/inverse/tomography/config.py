@@ -31,8 +31,6 @@ _START = 0.1
 """Part of their best surplus that new vertices start with: a ray passes many of them, and each one's best step would
 mend the same residual."""
 
-_ROUNDS, _ITERATIONS_PER_ROUND = 40, 20
-
 _LEAST_CELLS, _MOST_CELLS, _PIXELS_PER_CELL = 20_000, 300_000, 40
 
 _RANGES = {
@@ -116,9 +114,7 @@ class TomographyConfig(Schedule):
 
     def __post_init__(self) -> None:
         require_declared(self, FitError, "option ")
-        for name, (least, most) in _RANGES.items():
-            value = getattr(self, name)
-            require(value is None or least <= value <= most, name, value, f"at least {least} and at most {most}")
+        self._require_counts(_RANGES)
         for name in ("rate", "final_rate", "align_rate"):
             value = getattr(self, name)
             require(value > 0 and math.isfinite(value), name, value, "greater than 0 and finite")
@@ -156,5 +152,4 @@ class TomographyConfig(Schedule):
         if self.refine == "none":
             return None
         chosen: Exchange = getattr(self, self.refine)
-        rounds = chosen.rounds or max(1, min(_ROUNDS, self.steps // _ITERATIONS_PER_ROUND))
-        return dataclasses.replace(chosen, rounds=rounds)
+        return chosen.settling(self.steps)

@@ -199,19 +199,15 @@ class _Run:
         views = self.views_now()
         self.knots.zero_grad()
         total, squares = 0.0, 0.0
-        # The views' gradients meet at the function, behind which there is one graph.
-        function = self.knots.function()
-        parts = (function.scalar, function.opacity, function.color)
-        scalar, opacity, color = leaves = [part.detach().requires_grad_() for part in parts]
-        seen = self.field(TransferFunction(scalar, opacity, color))
+        function, hand_on = self.knots.opened()
+        seen = self.field(function)
         for view in views:
             loss, error = self.view_loss(seen, view)
             (loss / len(views)).backward()
             total += float(loss.detach()) / len(views)
             squares += error / len(views)
         rest = self.config.smoothness * self.knots.roughness()
-        pulled = [(part, leaf.grad) for part, leaf in zip(parts, leaves, strict=True) if leaf.grad is not None]
-        torch.autograd.backward([rest, *(whole for whole, _ in pulled)], [None, *(grad for _, grad in pulled)])
+        hand_on(rest)
         total += float(rest.detach())
         if not total < float("inf"):
             raise FitError(f"The loss is {shown(total)} after {self.iteration} iterations; take a smaller rate.")

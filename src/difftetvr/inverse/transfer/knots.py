@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 
 from difftetvr.inverse.transfer.config import TransferConfig
@@ -63,6 +65,24 @@ class Knots:
         places = torch.cumsum(torch.softmax(self.gaps, dim=0), dim=0)
         scalar = torch.cat((places.new_zeros(1), places[:-1].clamp(max=1.0), places.new_ones(1)))
         return TransferFunction(scalar, torch.sigmoid(self.opacity), torch.sigmoid(self.color), name)
+
+    def opened(self) -> tuple[TransferFunction, Callable[[torch.Tensor | None], None]]:
+        """The function for several views, whose gradients meet at its numbers: behind these there is one graph.
+
+        Returns:
+            The function, of leaf tensors; and what hands the gradients on that have gathered in them, together with
+            those of a scalar that depends on the knots themselves, if there is one.
+        """
+        function = self.function()
+        parts = (function.scalar, function.opacity, function.color)
+        scalar, opacity, color = leaves = [part.detach().requires_grad_() for part in parts]
+
+        def hand_on(rest: torch.Tensor | None = None) -> None:
+            pulled = [(part, leaf.grad) for part, leaf in zip(parts, leaves, strict=True) if leaf.grad is not None]
+            ends: list[tuple[torch.Tensor, torch.Tensor | None]] = [*pulled, *([] if rest is None else [(rest, None)])]
+            torch.autograd.backward([end for end, _ in ends], [gradient for _, gradient in ends])
+
+        return TransferFunction(scalar, opacity, color), hand_on
 
     def roughness(self) -> torch.Tensor:
         """Mean squared difference of neighbouring knots' colours and opacities."""

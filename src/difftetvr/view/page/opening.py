@@ -8,11 +8,10 @@ from typing import Any
 
 import torch
 
-from difftetvr.errors import MeshError
 from difftetvr.rendering import Camera
+from difftetvr.view.blank import require_drawable
 
 _DIRECTION, _UP, _FOV = (0.45, -1.0, 0.35), (0.0, 0.0, 1.0), 53.13
-_LEAST_SIZE, _MOST_SIZE = 1e-150, 1e150  # of meshes, so that squares of lengths are numbers
 
 
 @dataclass(frozen=True)
@@ -44,8 +43,7 @@ class Opening:
             MeshError: The box is too small or too large for squares of lengths.
         """
         size = float(extent.max())
-        if not _LEAST_SIZE < size < _MOST_SIZE:
-            raise MeshError(f"The mesh is {size:.3g} across, of which no picture can be computed; scale its positions.")
+        require_drawable(size, "The mesh")
         if camera is not None:
             return _as_camera(center, size, camera)
         direction = torch.tensor(_DIRECTION, dtype=torch.float64)
