@@ -136,14 +136,15 @@ class Render:
             raise CaptureError("--light is the direction to the light of --shade, and not 0 0 0; give both.")
 
     def _mesh_subject(self, data: MeshData, device: torch.device, console: Console) -> MeshSubject:
-        from difftetvr.cli.drawing.subjects import Drawing, MeshSubject
+        from difftetvr.cli.drawing.subjects import Drawing, MeshSubject, renderer_for
 
         if given := self.volume.given():
             raise DiffTetError(f"{self.model} is a mesh, of which --{given[0]} says nothing; leave it out.")
         shown = self.scalars.apply(data, self.model)
         if shown.note is not None:
             console.print(shown.note)
-        drawing = Drawing(self._renderer_for(shown.mesh, data.defects), self.clip, self.shade, self.light)
+        renderer = renderer_for(shown.mesh, data.defects, self.renderer)
+        drawing = Drawing(renderer, self.clip, self.shade, self.light)
         return MeshSubject(shown, drawing, device)
 
     def _volume_subject(self, device: torch.device, console: Console) -> VolumeSubject:
@@ -170,7 +171,7 @@ class Render:
         room = (ROOM_FOR_BAR if has_bar else 0.0, ROOM_FOR_AXES if has_axes else 0.0)
         shots = place.shots(subject.bounds, room)
         style = FrameStyle(
-            None if self.paper.transparent else self._background(place),
+            None if self.paper.transparent else place.background(self.background),
             subject.scale if has_bar else None,
             subject.axes(self.paper.unit or "") if has_axes else None,
         )
@@ -225,19 +226,13 @@ class Render:
         options = f"--transfer-function {path} --value-range {low:.9g} {high:.9g} --attenuation {subject.density:.6g}"
         console.print(f"Wrote {path}; the same picture: {options}", highlight=False)
 
-    def _background(self, place: Place) -> tuple[float, float, float]:
-        if self.background is not None:
-            return color_of(self.background)
-        if place.run is not None and place.is_of_photographs:
-            return place.run.fit.evaluation_background()
-        return color_of("black")
-
     def _draw_statistics(self, mesh: TetMesh, defects: Defects, place: Place, console: Console) -> None:
+        from difftetvr.cli.drawing.subjects import renderer_for
         from difftetvr.rendering.inspection import inspect_rays
         from difftetvr.view.heatmap import Scale, save_heatmap
 
         (camera,) = place.shots(mesh.bounds().double().cpu()).cameras
-        statistics = inspect_rays(mesh, camera, self._renderer_for(mesh, defects), self.clip)
+        statistics = inspect_rays(mesh, camera, renderer_for(mesh, defects, self.renderer), self.clip)
         if self.show == "depth-complexity":
             values = statistics.depth_complexity.float()
             most, mean = int(values.max()), float(values.mean())
@@ -249,8 +244,3 @@ class Render:
             seen = values[~values.isnan()]
             found = f"worst quality seen {float(seen.min()):.3g}" if seen.numel() else "no cell in sight"
         console.print(f"Wrote {self.output} ({found})", highlight=False)
-
-    def _renderer_for(self, mesh: TetMesh, defects: Defects) -> str:
-        # From cell to cell, marching would leave what another cell fills as well.
-        overlaps = not mesh.is_conforming or defects.doubled_places > 0
-        return self.renderer or ("linked-list" if overlaps else "marching")

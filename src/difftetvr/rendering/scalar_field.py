@@ -82,9 +82,17 @@ class ScalarField:
         """What files keep of it, by name: (N,) ``scalar``. The transfer function has files of its own."""
         return {"scalar": self.scalar}
 
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Scalars that stand for 0 and 1: the range, or the least and the greatest one where none is given."""
+        if self.value_range is not None:
+            return self.value_range
+        low, high = (float(v) for v in torch.aminmax(self.scalar.detach()))
+        return low, high
+
     def normalised(self) -> torch.Tensor:
         """The scalars in units of the range, so that the transfer function's [0, 1] spans it; differentiable."""
-        low, high = self.value_range or (float(v) for v in torch.aminmax(self.scalar.detach()))
+        low, high = self.limits
         limits = torch.finfo(self.scalar.dtype)
         # The difference of two numbers may overflow, that of their halves, quarters, ... does not.
         exponent = math.frexp(max(abs(low), abs(high)))[1]

@@ -4,6 +4,7 @@ from . import cut as cut
 from . import describe as describe
 from . import frames as frames
 from . import heatmap as heatmap
+from . import live as live
 from . import looks as looks
 from . import page as page
 from . import pictures as pictures

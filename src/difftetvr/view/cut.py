@@ -120,6 +120,24 @@ def cut_picture(
     return _with_outlines(picture, to_pixels(section.outlines), line) if outlines else picture
 
 
+def cut_edges(mesh: TetMesh, plane: Plane) -> np.ndarray:
+    """Where a plane cuts the cells of a mesh, as line segments.
+
+    Args:
+        mesh: The mesh.
+        plane: Where to cut.
+
+    Returns:
+        (M, 2, 3) float64 ends in world space, of the edges of each cell's section; those between two cells twice.
+
+    Raises:
+        MeshError: The plane misses the mesh, or its normal is no direction.
+    """
+    outlines = _section(mesh, plane, np.zeros((mesh.num_vertices, 1)), "vertex").outlines
+    right, up, _ = plane.axes()
+    return _origin(mesh, plane) + outlines[..., :1] * right + outlines[..., 1:] * up
+
+
 def _cropped(
     section: _Section, mesh: TetMesh, plane: Plane, within: torch.Tensor | None
 ) -> tuple[np.ndarray, np.ndarray]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from matplotlib import colormaps
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
@@ -13,7 +14,11 @@ from matplotlib.figure import Figure
 from difftetvr.errors import CaptureError
 from difftetvr.files import atomic_write
 
+COLORMAP = "viridis"
+"""The colours of numbers."""
+
 _DPI = 100
+_DARK = 0.08  # what is around pictures, and where there is no number
 _SCALE_WIDTH = 90  # pixels beside the picture
 _MARGIN = 0.08  # of the scale's ends, so that its numbers are whole
 
@@ -26,6 +31,18 @@ class Scale:
     lowest: float
     highest: float
     is_logarithmic: bool = False
+
+
+def heat_colors(values: torch.Tensor, scale: Scale) -> torch.Tensor:
+    """(H, W, 3) float32 colours of (H, W) numbers; NaN is left dark."""
+    numbers = values.detach().cpu().numpy()
+    colors = torch.from_numpy(colormaps[COLORMAP](_norm(scale)(numbers).filled(0.0))[..., :3]).float()
+    return torch.where(values.detach().cpu().isnan()[..., None], _DARK, colors)
+
+
+def _norm(scale: Scale) -> Normalize:
+    """Where on the colour scale numbers lie."""
+    return (LogNorm if scale.is_logarithmic else Normalize)(scale.lowest, scale.highest, clip=True)
 
 
 def save_heatmap(path: str | Path, values: torch.Tensor, scale: Scale) -> None:
@@ -41,15 +58,15 @@ def save_heatmap(path: str | Path, values: torch.Tensor, scale: Scale) -> None:
     """
     height, width = values.shape
     tall = max(height, 160)
-    figure = Figure(figsize=((width + _SCALE_WIDTH) / _DPI, tall / _DPI), dpi=_DPI, facecolor="0.08")
+    figure = Figure(figsize=((width + _SCALE_WIDTH) / _DPI, tall / _DPI), dpi=_DPI, facecolor=str(_DARK))
     canvas = FigureCanvasAgg(figure)
     whole = width + _SCALE_WIDTH
     axes = figure.add_axes((0.0, 1.0 - height / tall, width / whole, height / tall))
     axes.set_axis_off()
     image = axes.imshow(
         values.detach().cpu().numpy(),
-        cmap="viridis",
-        norm=(LogNorm if scale.is_logarithmic else Normalize)(scale.lowest, scale.highest, clip=True),
+        cmap=COLORMAP,
+        norm=_norm(scale),
         interpolation="nearest",
         aspect="auto",
     )

@@ -27,8 +27,9 @@ import torch
 from difftetvr.capture.camera_paths.spline import interpolated
 from difftetvr.capture.photos.poses import from_opengl
 from difftetvr.errors import CameraError, CaptureError, shown
+from difftetvr.files import atomic_write
 from difftetvr.inputs import require_type
-from difftetvr.rendering.cameras.camera_file import camera_from
+from difftetvr.rendering.cameras.camera_file import camera_from, content_of
 from difftetvr.rendering.cameras.pinhole import Camera
 from difftetvr.trust import require_regular
 
@@ -112,6 +113,23 @@ def _number(path: str | Path, content: dict[str, Any], name: str) -> float | Non
     if not is_number or not (math.isfinite(value) and 0 < value <= _MOST_FRAMES):
         raise CameraError(f"'{name}' of the camera path '{path}' is {shown(value)}; give a number greater than 0.")
     return float(value)
+
+
+def save_camera_path(path: str | Path, content: CameraPath) -> None:
+    """Writes a camera path in our own format, which :func:`load_camera_path` reads back to the bit.
+
+    Args:
+        path: File to write.
+        content: The path, of pinhole cameras without a lens.
+
+    Raises:
+        CameraError: A camera is another one, or the file cannot be written.
+    """
+    values: dict[str, Any] = {"format": PATH_FORMAT, "cameras": [content_of(camera) for camera in content.cameras]}
+    given = {"frames": content.frames, "loop": content.loop or None, "fps": content.fps}
+    values |= {name: value for name, value in given.items() if value is not None}
+    with atomic_write(path, CameraError) as temporary:
+        temporary.write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
 
 
 class _Nerfstudio:

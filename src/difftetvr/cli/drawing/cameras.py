@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import OmitArgPrefixes, arg
 
-from difftetvr.cli.options import saying
+from difftetvr.cli.options import Color, color_of, saying
 from difftetvr.cli.saved import SavedRun, run_behind, saved_beside
 from difftetvr.errors import CameraError, CaptureError, DiffTetError, counted
 
@@ -159,6 +159,19 @@ class Place:
     def views(self) -> CameraSet | None:
         """Cameras of the photographs that the model comes from; None where it comes from none, or they are gone."""
         return self._known_views() if self.is_of_photographs else None
+
+    def background(self, given: Color | None) -> tuple[float, float, float]:
+        """What is behind the model: what is given, else that of the run from photographs whose model it is, or black.
+
+        Args:
+            given: What the command line says.
+
+        Raises:
+            CaptureError: That is not finite.
+        """
+        if given is None and self._run is not None and self.is_of_photographs:
+            return self._run.fit.evaluation_background()
+        return color_of("black" if given is None else given)
 
     def shots(self, bounds: torch.Tensor, room: tuple[float, float] = (0.0, 0.0)) -> Shots:
         """The cameras.

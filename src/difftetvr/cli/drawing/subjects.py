@@ -8,6 +8,8 @@ import torch
 
 from difftetvr.cli.drawing.scalars import Shown, ShownVolume
 from difftetvr.errors import CaptureError
+from difftetvr.mesh import TetMesh
+from difftetvr.mesh.io import Defects
 from difftetvr.rendering import Camera, RenderedImage, render, render_shading
 from difftetvr.view.blank import why_blank
 from difftetvr.view.frames import AxesBox
@@ -32,6 +34,19 @@ class Drawing:
     clip: tuple[float, float, float, float] | None = None
     is_shaded: bool = False
     light: Color3 | None = None
+
+
+def renderer_for(mesh: TetMesh, defects: Defects, asked: str | None) -> str:
+    """How crossings with the cells of a mesh are found and ordered.
+
+    Args:
+        mesh: The mesh.
+        defects: What is wrong with it.
+        asked: What the command line says.
+    """
+    # From cell to cell, marching would leave what another cell fills as well.
+    overlaps = not mesh.is_conforming or defects.doubled_places > 0
+    return asked or ("linked-list" if overlaps else "marching")
 
 
 class MeshSubject:

@@ -41,11 +41,7 @@ def save_camera(path: str | Path, camera: Camera) -> None:
     Raises:
         CameraError: It is another camera, or the file cannot be written.
     """
-    if type(camera) is not Camera:
-        raise CameraError("Only pinhole cameras are saved one by one; save the capture of others.")
-    content: dict[str, Any] = {"format": CAMERA_FORMAT}
-    content["world_to_camera"] = camera.world_to_camera.detach().cpu().double().tolist()
-    content |= {name: getattr(camera, name) for name in (*_NUMBERS, *_SIZES)}
+    content = {"format": CAMERA_FORMAT, **content_of(camera)}
     with atomic_write(path, CameraError) as temporary:
         Path(temporary).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
@@ -70,6 +66,18 @@ def load_camera(path: str | Path) -> Camera:
     if not isinstance(content, dict) or content.get("format") != CAMERA_FORMAT:
         raise CameraError(f"'{path}' does not have the format '{CAMERA_FORMAT}'; give a file that save_camera wrote.")
     return camera_from(content, f"camera '{path}'")
+
+
+def content_of(camera: Camera) -> dict[str, Any]:
+    """What a file says of a camera, the inverse of `camera_from`.
+
+    Raises:
+        CameraError: It is no pinhole camera, or has a lens.
+    """
+    if type(camera) is not Camera:
+        raise CameraError("Only pinhole cameras are saved one by one; save the capture of others.")
+    pose = camera.world_to_camera.detach().cpu().double().tolist()
+    return {"world_to_camera": pose, **{name: getattr(camera, name) for name in (*_NUMBERS, *_SIZES)}}
 
 
 def camera_from(content: Any, name: str) -> Camera:

@@ -1,0 +1,11 @@
+from . import contents as contents
+from . import edited_function as edited_function
+from . import pace as pace
+from . import panels as panels
+from . import placement as placement
+from . import quantities as quantities
+from . import scene as scene
+from . import server as server
+from . import settings as settings
+from . import shooting as shooting
+from . import studio as studio

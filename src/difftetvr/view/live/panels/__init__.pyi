@@ -1,0 +1,6 @@
+from . import desk as desk
+from . import function as function
+from . import path as path
+from . import save as save
+from . import show as show
+from . import views as views

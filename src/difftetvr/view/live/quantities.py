@@ -1,0 +1,170 @@
+"""What is measured of each pixel, and which colour that has: the modes of the viewer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from PIL import Image
+
+from difftetvr.rendering import Camera
+from difftetvr.view.heatmap import Scale, heat_colors
+from difftetvr.view.live.scene import Scene
+from difftetvr.view.live.settings import Mode, Settings
+
+_LEAST_QUALITY = 1e-3
+_LEAST_OPACITY = 1.0 / 255.0  # of pixels whose depth says something
+_TAILS = 0.01  # of the depths at either end that do not stretch the scale
+_MOST_ERROR = 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class Painted:
+    """A picture.
+
+    Attributes:
+        pixels: (H, W, 3) uint8.
+        scale: Which number has which colour; None where colours are colours.
+    """
+
+    pixels: np.ndarray
+    scale: Scale | None = None
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """Something that is measured of pixels.
+
+    Attributes:
+        measure: (H, W, C) float32 of what a camera sees of a scene, whichever part of a window it looks at.
+        scale: Scale of the measured numbers of a whole picture; None: they are red, green, blue and opacity.
+    """
+
+    measure: Callable[[Scene, Settings, Camera], torch.Tensor]
+    scale: Callable[[torch.Tensor], Scale] | None = None
+
+
+def measured(scene: Scene, settings: Settings, camera: Camera) -> torch.Tensor:
+    """(H, W, C) float32 numbers, on the CPU, of which `painted` makes a picture once all rows are there."""
+    if scene.content is None:
+        return torch.zeros((camera.height, camera.width, 4))
+    with torch.no_grad():
+        return QUANTITIES[settings.mode].measure(scene, settings, camera).float().cpu()
+
+
+def painted(values: torch.Tensor, settings: Settings) -> Painted:
+    """The picture of a window.
+
+    Args:
+        values: (H, W, C) what was measured.
+        settings: How it was.
+    """
+    find_scale = QUANTITIES[settings.mode].scale
+    if find_scale is None:
+        behind = torch.tensor(settings.background)
+        return Painted(_bytes(values[..., :3] + (1.0 - values[..., 3:]) * behind))
+    numbers = values[..., 0]
+    scale = find_scale(numbers)
+    return Painted(_bytes(heat_colors(numbers, scale)), scale)
+
+
+def picture_of(scene: Scene, settings: Settings, camera: Camera) -> Image.Image:
+    """What a camera sees, at once and in full."""
+    return Image.fromarray(painted(measured(scene, settings, camera), settings).pixels)
+
+
+def _bytes(colors: torch.Tensor) -> np.ndarray:
+    return (colors.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).numpy()
+
+
+def _color(scene: Scene, settings: Settings, camera: Camera) -> torch.Tensor:
+    assert scene.content is not None
+    image = scene.content.seen_by(camera, settings)
+    return torch.cat((image.color, image.alpha[..., None]), -1)
+
+
+def _opacity(scene: Scene, settings: Settings, camera: Camera) -> torch.Tensor:
+    assert scene.content is not None
+    return scene.content.seen_by(camera, settings).alpha[..., None]
+
+
+def _depth(scene: Scene, settings: Settings, camera: Camera) -> torch.Tensor:
+    assert scene.content is not None
+    image = scene.content.seen_by(camera, settings)
+    return torch.where(image.alpha >= _LEAST_OPACITY, image.depth, torch.nan)[..., None]
+
+
+def _quality(scene: Scene, settings: Settings, camera: Camera) -> torch.Tensor:
+    assert scene.content is not None
+    return scene.content.met_by(camera, settings).worst_quality[..., None]
+
+
+def _complexity(scene: Scene, settings: Settings, camera: Camera) -> torch.Tensor:
+    assert scene.content is not None
+    return scene.content.met_by(camera, settings).depth_complexity[..., None]
+
+
+def _error(scene: Scene, settings: Settings, camera: Camera) -> torch.Tensor:
+    """How far what is seen differs from what the nearest photograph shows there; NaN where it shows nothing.
+
+    Each pixel is looked up where the photograph shows the point at its expected depth: from the photograph's own
+    camera its own pixel, from elsewhere the more roughly the farther that is and the less opaque what is seen.
+    """
+    assert scene.content is not None and scene.views is not None and scene.views.capture is not None
+    image, capture = scene.content.seen_by(camera, settings), scene.views.capture
+    view = scene.views.nearest_to(camera, scene.focus)
+    rays = camera.rays()
+    middle = (scene.focus - camera.position.detach().cpu().double()).norm()
+    depth = torch.where(image.alpha >= 0.5, image.depth, middle.to(image.depth))
+    origins, directions = (part.detach().double().cpu() for part in (rays.origins, rays.directions))
+    ahead = torch.nn.functional.normalize(directions, dim=-1)
+    points = origins + depth.double().cpu()[..., None] * ahead
+    places, enlarged = capture.cameras[view].project(points.reshape(-1, 3))
+    photograph = capture.images[view].float()
+    height, width = photograph.shape[:2]
+    column, row = places.unbind(-1)
+    is_inside = (enlarged > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    truth = _looked_up(photograph, column, row).reshape(*image.alpha.shape, 3)
+    seen = image.color.cpu() + (1.0 - image.alpha.cpu()[..., None]) * _behind(capture.alphas, view, settings)
+    error = (seen - truth).abs().mean(-1)
+    return torch.where(is_inside.reshape(error.shape), error, torch.nan)[..., None]
+
+
+def _behind(alphas: object, view: int, settings: Settings) -> torch.Tensor:
+    """What is behind a photograph: black where it is cut out, as it is kept over black."""
+    return torch.zeros(3) if alphas is not None else torch.tensor(settings.background)
+
+
+def _looked_up(image: torch.Tensor, column: torch.Tensor, row: torch.Tensor) -> torch.Tensor:
+    """(N, 3) an (H, W, 3) image at places in pixels, interpolated between their centres."""
+    height, width = image.shape[:2]
+    place = torch.stack((2.0 * column / width - 1.0, 2.0 * row / height - 1.0), -1).float()
+    found = torch.nn.functional.grid_sample(
+        image.permute(2, 0, 1)[None], place[None, None], padding_mode="border", align_corners=False
+    )
+    return found[0, :, 0].T
+
+
+def _scale_of_depth(values: torch.Tensor) -> Scale:
+    known = values[~values.isnan()]
+    if not known.numel():
+        return Scale("depth", 0.0, 1.0)
+    low, high = (float(end) for end in np.quantile(known.numpy(), (_TAILS, 1.0 - _TAILS)))
+    return Scale("depth", low, high if high > low else low + max(abs(low), 1.0) * 1e-6)
+
+
+def _scale_of_complexity(values: torch.Tensor) -> Scale:
+    return Scale("cells crossed", 0.0, max(float(values.max()), 1.0))
+
+
+QUANTITIES: dict[Mode, Quantity] = {
+    "color": Quantity(_color),
+    "depth": Quantity(_depth, _scale_of_depth),
+    "opacity": Quantity(_opacity, lambda values: Scale("opacity", 0.0, 1.0)),
+    "cell quality": Quantity(_quality, lambda values: Scale("worst quality Q", _LEAST_QUALITY, 1.0, True)),
+    "depth complexity": Quantity(_complexity, _scale_of_complexity),
+    "error": Quantity(_error, lambda values: Scale("error", 0.0, _MOST_ERROR)),
+}
+"""What is measured for each mode."""
