@@ -83,6 +83,11 @@ class Browser:
         self.call("Page.navigate", url=page.resolve().as_uri())
         self.wait_for("window.difftetvr || document.querySelector('.failure')")
 
+    def visit(self, address: str) -> None:
+        """Goes to an address and waits until something can be drawn there."""
+        self.call("Page.navigate", url=address)
+        self.wait_for("document.querySelector('canvas')")
+
     @property
     def failure(self) -> str | None:
         """What the page says that went wrong."""

@@ -191,7 +191,7 @@ class View:
 
     def _views_of(self, place: Place, console: Console) -> Views | None:
         """The views of the capture that a model comes from; None, with a line that says so, where they are gone."""
-        from difftetvr.capture import load_cameras
+        from difftetvr.capture import CameraSet, load_cameras
         from difftetvr.view.live.scene import Views
 
         run = place.run
@@ -203,7 +203,9 @@ class View:
             options = replace(options, downscale=self.downscale)
         try:
             if place.is_of_photographs:
-                return Views.of(options.sized_for(name, self.device, console).load(name, console))
+                capture = options.sized_for(name, self.device, console).load(name, console)
+                place.take(CameraSet(capture.cameras, capture.test, capture.name))
+                return Views.of(capture)
             with saying(console):
                 return Views.of(load_cameras(name, **options.given()))
         except DiffTetError as error:

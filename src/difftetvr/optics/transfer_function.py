@@ -197,10 +197,24 @@ class TransferFunction:
         opacity_points = _xml_points(path, root, "OpacityPoint", ("position", "opacity"))
         color_points = _xml_points(path, root, "ColorPoint", ("position", "r", "g", "b"))
         color_points[:, 1:] /= _XML_COLOR_MAXIMUM[encoding]
+        return TransferFunction.joined(opacity_points, color_points, str(path))
+
+    @staticmethod
+    def joined(opacity_points: np.ndarray, color_points: np.ndarray, name: str) -> TransferFunction:
+        """One whose opacity and colour have points of their own: the knots are the union of both.
+
+        Args:
+            opacity_points: (K, 2) scalars, not decreasing, and opacities there; two at one scalar are a jump.
+            color_points: (L, 4) scalars and linear RGB there, likewise.
+            name: What to call it.
+
+        Raises:
+            CaptureError: A value is out of range.
+        """
         knots = _union_of_knots(opacity_points[:, 0], color_points[:, 0])
         opacity, color = _resample(knots, opacity_points)[:, 0], _resample(knots, color_points)
         scalar = torch.tensor(knots[:, 0], dtype=torch.float32)
-        return TransferFunction(scalar, torch.tensor(opacity).float(), torch.tensor(color).float(), str(path))
+        return TransferFunction(scalar, torch.tensor(opacity).float(), torch.tensor(color).float(), name)
 
     def save(self, path: str | Path) -> None:
         """Write it as JSON that :meth:`from_json` reads back to the bit.

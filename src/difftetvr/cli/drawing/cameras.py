@@ -173,6 +173,10 @@ class Place:
             return self._run.fit.evaluation_background()
         return color_of("black" if given is None else given)
 
+    def take(self, views: CameraSet) -> None:
+        """Makes known the cameras of its capture to who has read them already."""
+        self._views = views
+
     def shots(self, bounds: torch.Tensor, room: tuple[float, float] = (0.0, 0.0)) -> Shots:
         """The cameras.
 

@@ -54,15 +54,10 @@ class EditedFunction:
     @property
     def function(self) -> TransferFunction:
         """The transfer function, whose knots are those of the opacity and those of the colours."""
-        own = self.colors.scalar.detach().cpu().double()
-        places = torch.tensor(self.places, dtype=torch.float64)
-        # Knots at one place make a jump; so each kind keeps its own, and the other is interpolated there.
-        others = own[~torch.isin(own, places)]
-        scalar, order = torch.sort(torch.cat((places, others)), stable=True)
-        between = np.interp(others.numpy(), self.places, self.opacities)
-        opacity = torch.cat((torch.tensor(self.opacities, dtype=torch.float64), torch.from_numpy(between)))[order]
-        color, _ = self.colors(scalar)
-        return TransferFunction(scalar.float(), opacity.float(), color.float(), self.colors.name)
+        opacity_points = np.stack((self.places, self.opacities), 1)
+        own = (self.colors.scalar[:, None], self.colors.color)
+        color_points = torch.cat(own, 1).detach().cpu().double().numpy()
+        return TransferFunction.joined(opacity_points, color_points, self.colors.name)
 
     def moved(self, places: tuple[float, ...]) -> EditedFunction:
         """The same with knots elsewhere; those that pass others are held up by them."""

@@ -8,7 +8,7 @@ FRAME_SECONDS = 0.06
 """What drawing a frame may take while something moves; with sending it, there is room for 10 frames a second."""
 
 _STEP = math.sqrt(0.5)  # sides of one level in those of the next finer one
-_COARSEST = 6
+_COARSEST = 8
 _LEAST_SIDE = 32
 _WEIGHT = 0.5  # of the last frame in the mean of all
 _ROOM = 0.6  # of the time a frame of the next finer level may take before that is gone over to

@@ -17,6 +17,7 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from difftetvr.errors import DiffTetError
+from difftetvr.fitting.loop import one_torch_thread
 from difftetvr.view.live.panels.desk import Desk
 from difftetvr.view.live.panels.function import FunctionPanel
 from difftetvr.view.live.panels.path import PathPanel
@@ -26,7 +27,7 @@ from difftetvr.view.live.panels.views import ViewsPanel
 from difftetvr.view.live.placement import Placement
 from difftetvr.view.live.quantities import Painted
 from difftetvr.view.live.scene import Scene
-from difftetvr.view.live.studio import Studio
+from difftetvr.view.live.studio import Studio, Window
 
 if TYPE_CHECKING:
     from viser import CameraHandle, ClientHandle, ViserServer
@@ -76,7 +77,7 @@ class LiveServer:
         self.studio = Studio(scene, self._complain)
         self.desk = Desk(self._server, self.studio, Placement.of(scene.bounds), listening.folder)
         self._show_panel: ShowPanel | None = None
-        self._clients: dict[int, Callable[[], None]] = {}
+        self._windows: dict[int, Window] = {}
         try:
             self._furnish(scene)
             self._server.on_client_connect(self._welcome)
@@ -114,14 +115,19 @@ class LiveServer:
             f"anyone in its network can, and can write files to {self._listening.folder}."
         )
 
+    def window_of(self, client: ClientHandle) -> Window:
+        """What a client looks through."""
+        return self._windows[client.client_id]
+
     def serve(self, is_over: Callable[[], bool] = lambda: False) -> None:
         """Draws for all who look, until something is over, or an interrupt.
 
         Args:
             is_over: Whether it is.
         """
-        while not is_over():
-            self.studio.work(_WAIT_SECONDS)
+        with one_torch_thread():
+            while not is_over():
+                self.studio.work(_WAIT_SECONDS)
 
     def _complain(self, sentence: str) -> None:
         self.desk.complain(sentence)
@@ -160,7 +166,7 @@ class LiveServer:
                 self._show_panel.tell_scale(picture.scale)
 
         window = self.studio.open(show)
-        self._clients[client.client_id] = lambda: self.studio.close(window)
+        self._windows[client.client_id] = window
 
         async def follow(camera: CameraHandle) -> None:  # in the order in which they come
             size = (camera.image_width, camera.image_height)
@@ -173,9 +179,9 @@ class LiveServer:
 
     def _part(self, client: ClientHandle) -> None:
         """Takes the window of a client away."""
-        close = self._clients.pop(client.client_id, None)
-        if close is not None:
-            close()
+        window = self._windows.pop(client.client_id, None)
+        if window is not None:
+            self.studio.close(window)
 
 
 def require_viewer() -> None:

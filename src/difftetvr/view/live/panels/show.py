@@ -68,6 +68,16 @@ class ClipPanel:
             handle.on_update(desk.guarded(lambda _: self._apply()))
         self._axis.on_update(desk.guarded(self._turn))
 
+    def choose(self, axis: str, is_on: bool, has_cells: bool) -> None:
+        """Sets the controls, as a hand would.
+
+        Args:
+            axis: x, y or z.
+            is_on: Whether anything is cut away.
+            has_cells: Whether the cells that are cut have outlines.
+        """
+        self._axis.value, self._is_on.value, self._has_cells.value = axis, is_on, has_cells
+
     def _turn(self, event: Any) -> None:
         if self._axis.value in _AXES:
             self._normal = np.array(_AXES[self._axis.value])

@@ -15,7 +15,8 @@ _ROOT, _POINTS = "/views", "/points"
 _MOST_IMAGES, _IMAGE_SIDE = 300, 96
 _MOST_POINTS = 200_000
 _TRAINING, _HELD_OUT = (90, 150, 240), (250, 160, 40)
-_SHARE = 0.12  # of a camera's distance from what it looks at that its frustum is long
+_SHARE = 0.025  # of a camera's distance from what it looks at that its frustum is large
+_HIDDEN = 2.5  # sizes of a frustum that are so near to an eye that they are not drawn: it may be that camera's own
 
 
 class ViewsPanel:
@@ -30,13 +31,14 @@ class ViewsPanel:
         self._desk, self._views = desk, views
         gui, count = desk.server.gui, len(views.cameras)
         with gui.add_folder("Photographs" if views.capture is not None else "Cameras"):
-            self._is_on = gui.add_checkbox("Show cameras", True)
+            self._is_on = gui.add_checkbox("Show cameras", views.capture is not None)
             self._size = gui.add_slider("Size", 0.1, 4.0, 0.1, 1.0)
             self._number = gui.add_number("View", 0, min=0, max=count - 1, step=1)
             self._go = gui.add_button("Look through it")
             self._nearest = gui.add_button("Look through the nearest")
         self._length = self._usual_length()
         self._frusta = self._placed()
+        desk.server.initial_camera.near = _HIDDEN * self._length
         self._place_points()
         self._is_on.on_update(lambda _: self._set_visible())
         self._size.on_update(lambda _: self._resize())
@@ -61,6 +63,7 @@ class ViewsPanel:
                 image=desk.bytes_of(views.capture.images[index], _IMAGE_SIDE) if views.capture and has_image else None,
                 wxyz=wxyz,
                 position=position,
+                visible=self._is_on.value,
             )
             frustum.on_click(desk.guarded(partial(self._jump, index)))
             frusta.append(frustum)
@@ -92,6 +95,10 @@ class ViewsPanel:
     def _resize(self) -> None:
         for frustum in self._frusta:
             frustum.scale = self._size.value * self._length
+        near = _HIDDEN * self._size.value * self._length
+        self._desk.server.initial_camera.near = near
+        for client in self._desk.server.get_clients().values():
+            client.camera.near = near
 
     def _jump(self, index: int, event: Any) -> None:
         if event.client is not None:
