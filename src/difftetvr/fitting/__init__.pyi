@@ -30,6 +30,7 @@ from .records.result import Progress as Progress
 from .refinement.exchange import Exchange as Exchange
 from .refinement.exchange import Grow as Grow
 from .refinement.star import Star as Star
+from .refinement.strategy import EmptySpace as EmptySpace
 from .refinement.strategy import Moment as Moment
 from .refinement.strategy import Refinement as Refinement
 from .refinement.strategy import Situation as Situation
@@ -39,6 +40,7 @@ from .regularizers import softplus_regularizer as softplus_regularizer
 
 __all__ = [
     "CameraRefinement",
+    "EmptySpace",
     "Evaluation",
     "Exchange",
     "FitConfig",
