@@ -26,7 +26,9 @@ from .records.evaluation import Evaluation as Evaluation
 from .records.evaluation import evaluate as evaluate
 from .records.progress import ProgressDisplay as ProgressDisplay
 from .records.result import FitResult as FitResult
+from .records.result import Picture as Picture
 from .records.result import Progress as Progress
+from .records.tensorboard import TensorBoardLogger as TensorBoardLogger
 from .refinement.exchange import Exchange as Exchange
 from .refinement.exchange import Grow as Grow
 from .refinement.star import Star as Star
@@ -48,6 +50,7 @@ __all__ = [
     "Grow",
     "Moment",
     "Motion",
+    "Picture",
     "Processes",
     "Progress",
     "ProgressDisplay",
@@ -57,6 +60,7 @@ __all__ = [
     "Star",
     "StepReport",
     "Strategy",
+    "TensorBoardLogger",
     "VertexOptimizer",
     "VertexOptimizerConfig",
     "evaluate",
