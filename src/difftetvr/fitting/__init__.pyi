@@ -28,6 +28,7 @@ from .records.progress import ProgressDisplay as ProgressDisplay
 from .records.result import FitResult as FitResult
 from .records.result import Picture as Picture
 from .records.result import Progress as Progress
+from .records.result import Reconstruction as Reconstruction
 from .records.tensorboard import TensorBoardLogger as TensorBoardLogger
 from .refinement.exchange import Exchange as Exchange
 from .refinement.exchange import Grow as Grow
@@ -54,6 +55,7 @@ __all__ = [
     "Processes",
     "Progress",
     "ProgressDisplay",
+    "Reconstruction",
     "RefinedCameras",
     "Refinement",
     "Situation",
