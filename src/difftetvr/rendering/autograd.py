@@ -19,6 +19,7 @@ from difftetvr.rendering.kernels.layout import GradientSource, collect
 from difftetvr.rendering.search.memory_order import MemoryOrder
 from difftetvr.rendering.task import RenderTask
 from difftetvr.rendering.traversal.crossing import Tracer
+from difftetvr.rendering.traversal.transfer import KNOT_RECORD
 
 
 class RenderFunction(torch.autograd.Function):
@@ -136,7 +137,8 @@ def gradient_tensors(
     parts = [cell_channels] if task.has_features else [channels] if has_channels else []
     parts.append(values)
     if gradients.knots is not None:
-        parts += [backend.tensor(gradients.knots), backend.tensor(gradients.values, -1, 4)]
+        by_knot = backend.tensor(gradients.knots, -1, KNOT_RECORD)
+        parts += [by_knot[:, 0], by_knot[:, 1:5]]
     return geometry, parts
 
 

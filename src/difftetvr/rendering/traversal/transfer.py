@@ -189,12 +189,8 @@ class Piece:
         return Piece(lower, upper, change, inverse_width, begin, end, (weights[0], weights[1]), ends[0], ends[1])
 
 
-@dataclass
-class TransferGradients:
-    """Gradients of (K,) knots and of (K, 4) densities and linear RGB; K floats and 4 K are the records."""
-
-    knots: Sums
-    values: Sums
+KNOT_RECORD = 8
+"""Floats of the sums of a knot: derivatives by its place, its density and linear RGB, and padding."""
 
 
 @dataclass
@@ -214,7 +210,7 @@ class PieceAdjoint:
         piece: Piece,
         entry: list[Any],
         leaving: list[Any],
-        gradients: TransferGradients,
+        gradients: Sums,
     ) -> None:
         self.transfer, self.piece, self.gradients = transfer, piece, gradients
         (t0, f0), (t1, f1) = entry, leaving
@@ -283,10 +279,9 @@ class PieceAdjoint:
         return (at_least & precedes & ~follows) | (at_greatest & follows & ~precedes)
 
     def _scatter(self, knot: Any, values: list[Any], position: Any, pixel: list[Any]) -> None:
-        record = [values[0], *(values[1] * g for g in pixel)]
-        self.gradients.knots.add(position, knot)
-        for k, value in enumerate(record):
-            self.gradients.values.add(value, 4 * knot + k)
+        record = [position, values[0], *(values[1] * g for g in pixel)]
+        record += [dr.zeros_like(position)] * (KNOT_RECORD - len(record))
+        self.gradients.add(self.transfer.backend.Floats(record), knot)
 
 
 def _inverse(difference: Any) -> Any:
