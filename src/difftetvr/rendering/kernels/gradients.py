@@ -25,6 +25,7 @@ class Wanted:
     vertices: bool
     limits: bool
     lines: bool = False
+    knots: bool = False
 
 
 @dataclass
@@ -37,7 +38,8 @@ class Gradients:
         cells: Of at least T cells, (M, width) records of channels and density; None where they hold nothing.
         vertices: (M, 4): x, y, z in the space of the vertices, and by the density or scalar where ``field`` is None;
             None if positions need no gradient.
-        knots: (K, 8) of the transfer function: by its knots, densities, linear RGB, and padding; None if there is none.
+        knots: (K, 8) of the transfer function: by its knots, densities, linear RGB, and padding; None if there is none,
+            or it needs no gradient.
         limits: (N, 2): the distances between which rays are looked at; None if they need no gradient.
         lines: (N, 6): the rays' origins and directions; None if they need no gradient.
     """
@@ -126,7 +128,7 @@ class BufferSizes:
             field * vertices if has_field else None,
             None if cells is None else records.width_of_sums * cells,
             _POSITION * vertices if wanted.vertices else None,
-            knots=None if view.transfer is None else KNOT_RECORD * dr.width(view.transfer.knots),
+            knots=KNOT_RECORD * dr.width(view.transfer.knots) if view.transfer is not None and wanted.knots else None,
             limits=2 * view.rays.count if wanted.limits else None,
             lines=6 * view.rays.count if wanted.lines else None,
             widths=(field, records.width_of_sums, _POSITION, KNOT_RECORD),

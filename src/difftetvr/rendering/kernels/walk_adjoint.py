@@ -175,8 +175,8 @@ class WalkAdjoint:
         Returns:
             The new progress, and derivatives with respect to distance, scalar and the cell's radiance at both ends.
         """
-        transfer, gradients = self.view.transfer, self.gradients.knots
-        assert transfer is not None and gradients is not None
+        transfer = self.view.transfer
+        assert transfer is not None
         # A jump's piece has no length, but moves with the jump.
         is_crossed = end[0] > start[0]
         color = self.color if radiance is None else []
@@ -188,7 +188,7 @@ class WalkAdjoint:
                 for v in (piece.start_values, piece.end_values)
             ]
             progress, at_start, at_end = self.cross(ends[0], ends[1], progress, is_crossed)
-            adjoint = PieceAdjoint(transfer, piece, start, end, gradients)
+            adjoint = PieceAdjoint(transfer, piece, start, end, self.gradients.knots)
             return progress, adjoint.add(at_start, at_end, color, total), seen + at_start[2] + at_end[2]
 
         zeros = [[dr.zeros_like(start[0]) for _ in range(2)] for _ in range(2)]
