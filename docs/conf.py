@@ -56,7 +56,7 @@ toc_object_entries_show_parents = "hide"
 nitpick_ignore_regex = [
     ("py:obj", ".*"),
     ("py:class", r"(torch|numpy|collections|pathlib|rich|PIL|types)\..*"),
-    ("py:class", r"Tensor|device|dtype|Location|difftetvr\..*\.(X|_Item|_Summed)"),
+    ("py:class", r"Tensor|device|dtype|Location|difftetvr\..*\.(X|_Item|_Summed|_Own)"),
 ]
 
 # ---- the examples, run

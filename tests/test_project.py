@@ -208,7 +208,7 @@ def test_the_package_says_that_it_is_typed_and_carries_its_data():
 
 
 def test_importing_the_package_asks_for_no_optional_package():
-    optional = ("viser", "pytetwild", "tetgen", "vtk", "matplotlib", "pytest")
+    optional = ("viser", "tensorboard", "lpips", "pytetwild", "tetgen", "vtk", "matplotlib", "pytest")
     code = f"import sys, difftetvr; print([name for name in {optional} if name in sys.modules])"
     environment = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)

@@ -164,6 +164,23 @@ def test_another_run_is_never_overwritten_unasked(run, tmp_path, capsys):
     assert (folder / "notes.txt").read_text() == "mine"
 
 
+def test_tensorboard_is_written_beside_the_run_and_replaced_with_it(tmp_path, capsys, monkeypatch):
+    pytest.importorskip("tensorboard")
+    folder = tmp_path / "out"
+    fit = ["fit", "tooth", "-o", str(folder), *VIEWS, *FIT, "--tensorboard"]
+    assert cli.main(fit) == 0
+    first = list((folder / "tensorboard").iterdir())
+    (folder / "tensorboard" / "notes.txt").write_text("mine")
+    assert cli.main([*fit, "--overwrite"]) == 0
+    second = [path for path in (folder / "tensorboard").iterdir() if path.suffix != ".txt"]
+    assert len(first) == len(second) == 1 and first != second
+    assert (folder / "tensorboard" / "notes.txt").exists()
+    model = (folder / "model.vtu").read_bytes()
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert "pip install 'difftetvr[tensorboard]'" in fails(capsys, *fit, "--overwrite")
+    assert (folder / "model.vtu").read_bytes() == model
+
+
 def test_bad_input_is_one_sentence_and_code_2(run, tmp_path, capsys):
     model = run / "model.vtu"
     (tmp_path / "broken.vtu").write_text("<VTKFile")

@@ -90,8 +90,18 @@ def test_a_run_that_was_interrupted_ends_as_if_it_had_not(scene, tmp_path, unkno
 
     with pytest.raises(KeyboardInterrupt):
         fit_scalar(capture, function, config, checkpoint=path, on_progress=stop)
-    resumed = fit_scalar(capture, function, config, checkpoint=path, resume=True, on_progress=seen.append)
+    pictures = []
+
+    def look(progress) -> None:
+        seen.append(progress)
+        if progress.iteration == 30:
+            pictures.append((progress.picture(1), progress.field))
+
+    resumed = fit_scalar(capture, function, config, checkpoint=path, resume=True, on_progress=look)
     assert [progress.iteration for progress in seen] == list(range(18, 31))
+    picture, field = pictures[0]
+    assert torch.equal(field.scalar, resumed.field.scalar)
+    assert torch.equal(picture.rendered, dtv.render(resumed.mesh, resumed.field, capture.cameras[1]).color)
     assert torch.equal(resumed.field.scalar, whole.field.scalar)
     assert torch.equal(resumed.mesh.vertices, whole.mesh.vertices)
     assert torch.equal(resumed.transfer_function.opacity, whole.transfer_function.opacity)

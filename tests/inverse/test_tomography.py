@@ -194,6 +194,27 @@ def test_a_run_explains_held_out_views(geometry: dict[str, object]) -> None:
     assert free.metrics["projection_psnr"] == free.score.mean_psnr
 
 
+def test_progress_shows_projections_in_grey() -> None:
+    mesh = jittered(dtype=torch.float32)
+    capture = scan_of(mesh, ball(mesh), COARSE, holdout=4)
+    valid = torch.ones_like(capture.line_integrals, dtype=torch.bool)
+    valid[2, :3] = False
+    seen = []
+
+    def look(progress: dtv.fitting.Progress) -> None:
+        if progress.iteration == progress.iterations:
+            seen.append((progress.picture(2), progress.mesh, progress.field))
+
+    reconstruct(dataclasses.replace(capture, valid=valid), small(iterations=5, solve_steps=0), on_progress=look)
+    picture, found, field = seen[0]
+    peak = float(capture.line_integrals[valid].max())
+    expected = integrals(found, field.density, capture.geometry.view(2)) / peak
+    assert picture.rendered.shape == picture.truth.shape == (14, 16, 3)
+    assert torch.allclose(picture.rendered[3:, :, 0], expected[3:], atol=1e-5)
+    assert torch.equal(picture.rendered[:3], picture.truth[:3])
+    assert torch.allclose(picture.truth[3:, :, 1], capture.line_integrals[2, 3:] / peak)
+
+
 def test_a_run_that_is_resumed_ends_as_if_it_had_not_stopped(tmp_path) -> None:
     mesh = jittered(dtype=torch.float32)
     capture, path = scan_of(mesh, ball(mesh), CONE), tmp_path / "run.safetensors"

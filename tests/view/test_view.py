@@ -111,6 +111,9 @@ def status(**changes):
         "refinements": 0,
         "last_refinement": None,
         "seconds": 1.0,
+        "glanced_views": [],
+        "glanced_at": None,
+        "reconstruction": None,
     }
     return Progress(**(values | changes))
 

@@ -7,7 +7,7 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import tyro
 from tyro.conf import OmitArgPrefixes, Positional, arg
@@ -38,6 +38,8 @@ class Eval:
     """File to write the numbers to, JSON."""
     all_views: bool = False
     """Compare with the training views, too."""
+    lpips: Literal["alex", "vgg"] | None = None
+    """Tell LPIPS, too, through this network (extra `lpips`)."""
     background: Color | None = None
     """Behind the volume: black, white or R G B; default: that of the run, else white for photographs that alpha cuts
     out, black for all others."""
@@ -50,12 +52,15 @@ class Eval:
     def run(self, console: Console) -> None:
         """Renders the views and prints PSNR and SSIM of each."""
         from difftetvr.fitting.records.evaluation import evaluate, usual_background
+        from difftetvr.fitting.records.perceptual import lpips_of, require_lpips
         from difftetvr.view.describe import evaluation_table
 
         if self.capture is None:
             raise FitError(f"No config.json of a run lies beside {self.model} and says what it fits; name CAPTURE.")
         if self.output is not None:
             require_writable(self.output, FitError)
+        if self.lpips is not None:
+            require_lpips(self.lpips)
         given = None if self.background is None else color_of(self.background)
         mesh, field_on_mesh = load_model(self.model, self.device, console=console)
         views_of = self.views_of.sized_for(self.capture, self.device, console)
@@ -66,9 +71,14 @@ class Eval:
         if not views:
             raise FitError(f"'{capture.name}' holds out no views; compare with all of them with --all-views.")
         evaluation = evaluate(mesh, field_on_mesh, capture, views, background)
-        console.print(evaluation_table(evaluation))
+        numbers, lpips = evaluation.to_json(), None
+        if self.lpips is not None:
+            lpips = lpips_of(mesh, field_on_mesh, capture, evaluation.views, self.lpips, background)
+            mean = sum(lpips) / len(lpips) if lpips else None
+            numbers |= {"lpips": mean, "lpips_per_view": lpips, "lpips_network": self.lpips}
+        console.print(evaluation_table(evaluation, lpips))
         if self.output is not None:
-            write_json(self.output, evaluation.to_json())
+            write_json(self.output, numbers)
 
     @staticmethod
     def defaults(args: Sequence[str]) -> Eval | None:

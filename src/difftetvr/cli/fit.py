@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import shlex
 import signal
 import warnings
 from collections.abc import Iterator, Sequence
@@ -16,6 +15,7 @@ import tyro
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from difftetvr.cli.arguments import Groups
+from difftetvr.cli.inverse.run_command import WatchOptions
 from difftetvr.cli.options import CAPTURE_GROUPS, CaptureOptions, TrustOptions
 from difftetvr.cli.saved import SavedRun, saved_run
 from difftetvr.errors import DiffTetError, FitError, counted
@@ -55,6 +55,7 @@ class Fit:
     given are taken from it."""
     overwrite: bool = False
     """Replace the run in the output folder."""
+    watch: OmitArgPrefixes[WatchOptions] = field(default_factory=WatchOptions)
     trust: OmitArgPrefixes[TrustOptions] = field(default_factory=TrustOptions)
     groups: ClassVar[Groups] = {
         "Most used": (
@@ -70,7 +71,7 @@ class Fit:
         ),
         "Cameras that are not known well": ("refine-poses", "refine-intrinsics", "cameras.*"),
         **CAPTURE_GROUPS,
-        "Output": ("evaluate-every", "checkpoint-seconds"),
+        "Output": ("evaluate-every", "checkpoint-seconds", "tensorboard"),
     }
 
     def run(self, console: Console) -> None:
@@ -89,6 +90,7 @@ class Fit:
 
         folder = RunFolder(self.output)
         with folder.claimed(), _undisturbed(processes):
+            self.watch.require()
             self._require_same_run(folder)
             folder.require_free(resume=self.resume, overwrite=self.overwrite)
             views_of = self.views_of.sized_for(self.capture, self.config.device, console)
@@ -131,15 +133,9 @@ class Fit:
 
     def _optimise(self, trainer: Trainer, folder: RunFolder, console: Console) -> FitResult:
         from difftetvr.fitting.loop import optimise
-        from difftetvr.fitting.records.progress import ProgressDisplay
 
-        try:
-            with ProgressDisplay(console) as display:
-                return optimise(trainer, folder.checkpoint, display)
-        except KeyboardInterrupt:
-            command = shlex.join(["difftetvr", "fit", "-o", str(self.output), "--resume"])
-            console.print(f"Interrupted; continue with: {command}")
-            raise
+        with self.watch.telling(folder, console) as tell:
+            return optimise(trainer, folder.checkpoint, tell)
 
     def to_json(self) -> dict[str, Any]:
         """The options that make the run what it is."""

@@ -26,10 +26,14 @@ from .records.evaluation import Evaluation as Evaluation
 from .records.evaluation import evaluate as evaluate
 from .records.progress import ProgressDisplay as ProgressDisplay
 from .records.result import FitResult as FitResult
+from .records.result import Picture as Picture
 from .records.result import Progress as Progress
+from .records.result import Reconstruction as Reconstruction
+from .records.tensorboard import TensorBoardLogger as TensorBoardLogger
 from .refinement.exchange import Exchange as Exchange
 from .refinement.exchange import Grow as Grow
 from .refinement.star import Star as Star
+from .refinement.strategy import EmptySpace as EmptySpace
 from .refinement.strategy import Moment as Moment
 from .refinement.strategy import Refinement as Refinement
 from .refinement.strategy import Situation as Situation
@@ -39,6 +43,7 @@ from .regularizers import softplus_regularizer as softplus_regularizer
 
 __all__ = [
     "CameraRefinement",
+    "EmptySpace",
     "Evaluation",
     "Exchange",
     "FitConfig",
@@ -46,15 +51,18 @@ __all__ = [
     "Grow",
     "Moment",
     "Motion",
+    "Picture",
     "Processes",
     "Progress",
     "ProgressDisplay",
+    "Reconstruction",
     "RefinedCameras",
     "Refinement",
     "Situation",
     "Star",
     "StepReport",
     "Strategy",
+    "TensorBoardLogger",
     "VertexOptimizer",
     "VertexOptimizerConfig",
     "evaluate",

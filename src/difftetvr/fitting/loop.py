@@ -143,8 +143,7 @@ def optimise(
         tested: list[int] = trainer.capture.test_indices.tolist()
         trainer.align(tested)
         evaluation = trainer.evaluate(tested)
-    field = trainer.parameters.detached_field()
-    return FitResult(trainer.mesh, field, evaluation, trainer.history, trainer.config, trainer.cameras)
+    return FitResult(trainer.mesh, trainer.field(), evaluation, trainer.history, trainer.config, trainer.cameras)
 
 
 def _require_kinds(capture: object, config: object, mesh: object, strategy: object, on_progress: object) -> None:

@@ -20,12 +20,13 @@ from difftetvr.fitting.parameters import FieldParameters
 from difftetvr.fitting.positions import VertexOptimizer
 from difftetvr.fitting.processes import ALONE, Processes
 from difftetvr.fitting.records.checkpoint import Checkpoint, describe_capture, require_same_capture
-from difftetvr.fitting.records.evaluation import Evaluation, compared
+from difftetvr.fitting.records.evaluation import Evaluation, compared, seen_and_true
 from difftetvr.fitting.records.history import History
 from difftetvr.fitting.records.unread import Unread
 from difftetvr.fitting.refinement import Refinement, Situation, Strategy
 from difftetvr.fitting.refinement.adaptive_run import AdaptiveRun
 from difftetvr.fitting.refinement.pixels import Judgement
+from difftetvr.mesh.field import Field
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.rendering.gauss_newton import ImageModel
 
@@ -148,18 +149,25 @@ class Trainer(AdaptiveRun):
         Args:
             views: Indices of the views to compare.
         """
-        mesh, field, background = self.mesh, self.parameters.detached_field(), self.config.evaluation_background()
+        mesh, field, background = self.mesh, self.field(), self.config.evaluation_background()
         own = [compared(mesh, field, self._truth, [view], background).row for view in self.processes.share(views)]
         return Evaluation.of_rows(self.processes.gathered(own, len(views), 3))
 
     def _mean_psnr(self, views: list[int]) -> float | None:
         return self.evaluate(views).mean_psnr
 
+    def field(self) -> Field:
+        """Colours and densities as they are now, detached."""
+        return self.parameters.detached_field()
+
+    def _seen_and_true(self, view: int) -> tuple[torch.Tensor, torch.Tensor]:
+        return seen_and_true(self.mesh, self.field(), self._truth, view, self.config.evaluation_background())
+
     def align(self, views: list[int]) -> None:
         """Moves held-out cameras to where their images fit best, where cameras are refined."""
         if self.cameras is None or not self.config.refine_poses:
             return
-        field, options = self.parameters.detached_field(), self.config.cameras
+        field, options = self.field(), self.config.cameras
         background = self.config.evaluation_background()
         align_held_out(
             *(self.cameras, options, self.mesh, field, self._truth, views, background),
@@ -263,13 +271,13 @@ class Trainer(AdaptiveRun):
 
         def model(steps: torch.Tensor | None) -> ImageModel:
             in_units = None if steps is None else torch.cat((steps[:, :3], unit * steps[:, 3:]), 1)
-            field, deterministic = self.parameters.detached_field(), self.config.deterministic
+            field, deterministic = self.field(), self.config.deterministic
             return judgement.model(mesh, field, deterministic, in_units).with_density_unit(unit)
 
         values = self.parameters.values(unit)
         situation = Situation(mesh, values, self._moment(), model, self._color_gradients, self._free_space)
         judges = judgement.some()
-        self._refine_by(strategy, situation, lambda: judges.error(self.mesh, self.parameters.detached_field()))
+        self._refine_by(strategy, situation, lambda: judges.error(self.mesh, self.field()))
 
     def _judgement(self, views: int) -> Judgement:
         """What a refinement is judged on."""

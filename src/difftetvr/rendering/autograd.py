@@ -19,6 +19,7 @@ from difftetvr.rendering.kernels.layout import GradientSource, collect
 from difftetvr.rendering.search.memory_order import MemoryOrder
 from difftetvr.rendering.task import RenderTask
 from difftetvr.rendering.traversal.crossing import Tracer
+from difftetvr.rendering.traversal.transfer import KNOT_RECORD
 
 
 class RenderFunction(torch.autograd.Function):
@@ -59,7 +60,8 @@ class RenderFunction(torch.autograd.Function):
         task, backend, shot = ctx.task, ctx.task.backend, ctx.shot
         vertices, pose, optical_depth = ctx.saved_tensors
         needs_vertices, needs_pose, needs_background, needs_limits, needs_lines = ctx.needs_input_grad[2:7]
-        wanted = Wanted(needs_vertices or needs_pose, needs_limits, needs_lines)
+        needs_knots = task.content == "scalar" and any(ctx.needs_input_grad[-2:])
+        wanted = Wanted(needs_vertices or needs_pose, needs_limits, needs_lines, needs_knots)
         derivatives = [None if part is None or not part.numel() else backend.floats(part) for part in by_image]
         with with_flags(ctx.flags), backend.exclusive(task.deterministic):
             image = ImageAdjoint(Pixels(*derivatives), ctx.how, *ctx.gathered)
@@ -135,8 +137,11 @@ def gradient_tensors(
         return geometry, [cell_channels, cell_densities]
     parts = [cell_channels] if task.has_features else [channels] if has_channels else []
     parts.append(values)
-    if gradients.knots is not None:
-        parts += [backend.tensor(gradients.knots), backend.tensor(gradients.values, -1, 4)]
+    if task.content == "scalar" and gradients.knots is None:
+        parts += [None, None]
+    elif task.content == "scalar":
+        by_knot = backend.tensor(gradients.knots, -1, KNOT_RECORD)
+        parts += [by_knot[:, 0], by_knot[:, 1:5]]
     return geometry, parts
 
 

@@ -184,19 +184,25 @@ def volume_table(name: str, summary: VolumeSummary) -> Table:
     return table
 
 
-def evaluation_table(evaluation: Evaluation) -> Table:
-    """PSNR and SSIM per view, and their means."""
+def evaluation_table(evaluation: Evaluation, lpips: list[float] | None = None) -> Table:
+    """PSNR and SSIM per view, LPIPS where it is known, and their means."""
+    columns = {"PSNR (dB)": [f"{value:.2f}" for value in _with_mean(evaluation.psnr)]}
+    columns["SSIM"] = [f"{value:.4f}" for value in _with_mean(evaluation.ssim)]
+    if lpips is not None:
+        columns["LPIPS"] = [f"{value:.4f}" for value in _with_mean(lpips)]
     table = Table()
-    for column in ("view", "PSNR (dB)", "SSIM"):
+    for column in ("view", *columns):
         table.add_column(column, justify="right")
-    ssims = [f"{value:.4f}" for value in evaluation.ssim] or ["-"] * len(evaluation.views)
-    for view, psnr, ssim in zip(evaluation.views, evaluation.psnr, ssims, strict=True):
-        table.add_row(str(view), f"{psnr:.2f}", ssim)
-    mean_ssim = "-" if evaluation.mean_ssim is None else f"{evaluation.mean_ssim:.4f}"
-    if evaluation.mean_psnr is not None:
-        table.add_section()
-        table.add_row("mean", f"{evaluation.mean_psnr:.2f}", mean_ssim)
+    names = [*map(str, evaluation.views), "mean"] if evaluation.views else []
+    for row, name in enumerate(names):
+        if name == "mean":
+            table.add_section()
+        table.add_row(name, *(values[row] if values else "-" for values in columns.values()))
     return table
+
+
+def _with_mean(values: list[float]) -> list[float]:
+    return [*values, sum(values) / len(values)] if values else []
 
 
 def _quality_table(mesh: TetMesh) -> Table:

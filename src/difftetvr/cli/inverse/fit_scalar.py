@@ -12,7 +12,7 @@ import tyro
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from difftetvr.cli.arguments import Groups
-from difftetvr.cli.inverse.run_command import Begun, RunCommand
+from difftetvr.cli.inverse.run_command import Begun, RunCommand, WatchOptions
 from difftetvr.cli.options import CAPTURE_GROUPS, CaptureOptions, TrustOptions, is_volume
 from difftetvr.cli.saved import folder_to_resume, goes_on_with, saved_options
 from difftetvr.errors import FitError, counted
@@ -59,6 +59,7 @@ class FitScalar(RunCommand):
     given are taken from it."""
     overwrite: bool = False
     """Replace the run in the output folder."""
+    watch: OmitArgPrefixes[WatchOptions] = field(default_factory=WatchOptions)
     trust: OmitArgPrefixes[TrustOptions] = field(default_factory=TrustOptions)
     groups: ClassVar[Groups] = {
         "Most used": (
@@ -72,7 +73,7 @@ class FitScalar(RunCommand):
             *("knots", "function-rate", "seed", "deterministic"),
         ),
         **CAPTURE_GROUPS,
-        "Output": ("evaluate-every", "checkpoint-seconds"),
+        "Output": ("evaluate-every", "checkpoint-seconds", "tensorboard"),
     }
 
     def begin(self, console: Console, checkpoint: Path | None) -> Begun:

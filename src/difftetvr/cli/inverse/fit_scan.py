@@ -13,7 +13,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from difftetvr.capture.projections.naming import is_projection_source
 from difftetvr.cli.arguments import Groups
-from difftetvr.cli.inverse.run_command import Begun, RunCommand
+from difftetvr.cli.inverse.run_command import Begun, RunCommand, WatchOptions
 from difftetvr.cli.options import TRUST_GROUPS, TrustOptions, saying
 from difftetvr.cli.saved import folder_to_resume, goes_on_with, saved_options
 from difftetvr.errors import FitError, counted
@@ -92,6 +92,7 @@ class FitScan(RunCommand):
     given are taken from it."""
     overwrite: bool = False
     """Replace the run in the output folder."""
+    watch: OmitArgPrefixes[WatchOptions] = field(default_factory=WatchOptions)
     trust: OmitArgPrefixes[TrustOptions] = field(default_factory=TrustOptions)
     groups: ClassVar[Groups] = {
         "Most used": (
@@ -105,7 +106,7 @@ class FitScan(RunCommand):
         "Optimisation": ("rate", "final-rate", "betas", "seed", "deterministic"),
         "How SCAN is read": ("geometry", "center", "pixel-size", "unit", "gaussian"),
         **TRUST_GROUPS,
-        "Output": ("evaluate-every", "checkpoint-seconds"),
+        "Output": ("evaluate-every", "checkpoint-seconds", "tensorboard"),
     }
 
     def begin(self, console: Console, checkpoint: Path | None) -> Begun:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +14,57 @@ from difftetvr.terminal import waiting
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+    from difftetvr.fitting.records.result import Progress
+
+
+@dataclass(frozen=True)
+class WatchOptions:
+    """Who is told how a run goes."""
+
+    tensorboard: bool = False
+    """Write curves, held-out pictures and the quality of cells into OUT/tensorboard, for `tensorboard --logdir`."""
+
+    def require(self) -> None:
+        """Checks that they can be told, before anything is read or replaced.
+
+        Raises:
+            FitError: TensorBoard is not installed.
+        """
+        from difftetvr.fitting.records.tensorboard import require_tensorboard
+
+        if self.tensorboard:
+            require_tensorboard()
+
+    @contextlib.contextmanager
+    def telling(self, folder: RunFolder, console: Console) -> Iterator[Callable[[Progress], None]]:
+        """Context of a run that can be gone on with: gives what to call after every iteration.
+
+        Args:
+            folder: The run's.
+            console: Where its progress is shown.
+
+        Raises:
+            FitError: TensorBoard is not installed, or nothing can be written into its folder.
+        """
+        from difftetvr.fitting.records.progress import ProgressDisplay
+        from difftetvr.fitting.records.tensorboard import TensorBoardLogger
+
+        try:
+            with contextlib.ExitStack() as stack:
+                listeners: list[Callable[[Progress], None]] = [stack.enter_context(ProgressDisplay(console))]
+                if self.tensorboard:
+                    listeners.append(stack.enter_context(TensorBoardLogger(folder.logs)))
+
+                def tell(progress: Progress) -> None:
+                    for listener in listeners:
+                        listener(progress)
+
+                yield tell
+        except KeyboardInterrupt:
+            command = shlex.join(["difftetvr", "fit", "-o", str(folder.path), "--resume"])
+            console.print(f"Interrupted; continue with: {command}")
+            raise
 
 
 @dataclass(frozen=True)
@@ -39,11 +91,13 @@ class RunCommand:
         output: The folder.
         resume: Whether to go on with the run there.
         overwrite: Whether to replace it.
+        watch: Who is told how it goes.
     """
 
     output: Path
     resume: bool
     overwrite: bool
+    watch: WatchOptions
 
     def require_same_run(self, folder: RunFolder) -> None:
         """Checks that the run to go on with is the one that is asked for.
@@ -66,6 +120,7 @@ class RunCommand:
         """Reconstructs, and fills the output folder."""
         folder = RunFolder(self.output)
         with folder.claimed():
+            self.watch.require()
             if self.resume:
                 self.require_same_run(folder)
             folder.require_free(resume=self.resume, overwrite=self.overwrite)
@@ -77,12 +132,5 @@ class RunCommand:
         console.print("\n".join(lines), highlight=False)
 
     def _optimise(self, begun: Begun, folder: RunFolder, console: Console) -> Any:
-        from difftetvr.fitting.records.progress import ProgressDisplay
-
-        try:
-            with ProgressDisplay(console) as display:
-                return begun.optimise(folder.checkpoint, display)
-        except KeyboardInterrupt:
-            command = shlex.join(["difftetvr", "fit", "-o", str(self.output), "--resume"])
-            console.print(f"Interrupted; continue with: {command}")
-            raise
+        with self.watch.telling(folder, console) as tell:
+            return begun.optimise(folder.checkpoint, tell)

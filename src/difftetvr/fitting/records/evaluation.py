@@ -119,13 +119,20 @@ def compared(
     psnrs, ssims = [], []
     views = [view for view in views if truth.share(view) > 0.0]
     for view in views:
-        expected = truth.image(view, background)
-        image = _rendered(mesh, field, truth, view, background).to(truth.device)
-        image = truth.where_valid(view, image, expected)
+        image, expected = seen_and_true(mesh, field, truth, view, background)
         psnrs.append(psnr(image, expected, truth.share(view)))
         if min(expected.shape[:2]) >= SSIM_WINDOW:
             ssims.append(ssim(image, expected))
     return Evaluation(views, psnrs, ssims)
+
+
+def seen_and_true(
+    mesh: TetMesh, field: Field | ScalarField, truth: Truth, view: int, background: Color = BLACK
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """(H, W, 3) image of the reconstruction and of the capture, the same in pixels that do not count."""
+    expected = truth.image(view, background)
+    image = _rendered(mesh, field, truth, view, background).to(truth.device)
+    return truth.where_valid(view, image, expected), expected
 
 
 @torch.no_grad()

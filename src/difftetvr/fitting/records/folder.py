@@ -77,8 +77,13 @@ class RunFolder:
         return self.path / "views"
 
     @property
+    def logs(self) -> Path:
+        """Folder of what TensorBoard shows."""
+        return self.path / "tensorboard"
+
+    @property
     def files(self) -> tuple[Path, ...]:
-        """All of these but the folder of pictures.
+        """All of these but the folders of pictures and logs.
 
         In this order they are removed: cut short, that never leaves a state to resume from without the options that it
         belongs to.
@@ -120,10 +125,11 @@ class RunFolder:
         for path in self.files:
             if path.is_dir():
                 raise FitError(f"{path} is a folder where the {path.stem} should be a file; rename or remove it.")
-        if self.views.exists():
-            if not self.views.is_dir():
-                raise FitError(f"{self.views} is a file where the folder of pictures should be; rename or remove it.")
-            require_writable_folder(self.views, FitError)
+        for folder, content in ((self.views, "pictures"), (self.logs, "logs")):
+            if folder.exists():
+                if not folder.is_dir():
+                    raise FitError(f"{folder} is a file where the folder of {content} should be; rename or remove it.")
+                require_writable_folder(folder, FitError)
 
     @contextmanager
     def claimed(self) -> Iterator[None]:
@@ -187,6 +193,8 @@ class RunFolder:
             for kind in _PICTURES:
                 for picture in self.views.glob(f"*_{kind}.png"):
                     picture.unlink()
+            for events in self.logs.glob("events.out.tfevents.*"):
+                events.unlink()
             self.files[-1].unlink(missing_ok=True)
         except OSError as error:
             raise self._unusable(error) from error

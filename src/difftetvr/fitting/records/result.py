@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
+
+import torch
 
 from difftetvr.fitting.cameras.refined import RefinedCameras
 from difftetvr.fitting.config import FitConfig
@@ -11,11 +14,48 @@ from difftetvr.fitting.records.evaluation import Evaluation
 from difftetvr.fitting.records.history import History, MoveTotals, RefinementRecord
 from difftetvr.mesh.field import Field
 from difftetvr.mesh.tetmesh import TetMesh
+from difftetvr.rendering import ScalarField
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A view as it is predicted and as it should be, to be looked at.
+
+    Attributes:
+        view: Its index in the capture.
+        rendered: (H, W, 3) what the reconstruction looks like, on the CPU; of projections the line integrals in grey,
+            1 where they are as great as the greatest of the scan.
+        truth: (H, W, 3) what was seen. Pixels that do not count are the same in both.
+    """
+
+    view: int
+    rendered: torch.Tensor
+    truth: torch.Tensor
+
+
+class Reconstruction(Protocol):
+    """What is reconstructed, between two iterations."""
+
+    @property
+    def mesh(self) -> TetMesh:
+        """The mesh as it is now, detached."""
+        ...
+
+    def field(self) -> Field | ScalarField:
+        """What is on it now, detached."""
+        ...
+
+    def picture(self, view: int | None = None) -> Picture:
+        """A view as it looks now; default: the last one that was learned from."""
+        ...
 
 
 @dataclass(frozen=True)
 class Progress:
     """Where a running reconstruction stands.
+
+    Mesh, field and pictures are made when they are asked for, and are what they are then: ask while ``on_progress`` is
+    called, and keep the answers, not this.
 
     Attributes:
         iteration: Iterations done.
@@ -28,6 +68,9 @@ class Progress:
         refinements: Refinements so far.
         last_refinement: The last one; None before the first.
         seconds: Time spent so far, over all sessions.
+        glanced_views: Held-out views that are looked at from time to time.
+        glanced_at: Iterations done when they were looked at last; None before the first time.
+        reconstruction: What mesh, field and pictures are asked of.
     """
 
     iteration: int
@@ -40,6 +83,27 @@ class Progress:
     refinements: int
     last_refinement: RefinementRecord | None
     seconds: float
+    glanced_views: list[int]
+    glanced_at: int | None
+    reconstruction: Reconstruction = dataclasses.field(repr=False, compare=False)
+
+    @property
+    def mesh(self) -> TetMesh:
+        """The mesh as it is now, detached."""
+        return self.reconstruction.mesh
+
+    @property
+    def field(self) -> Field | ScalarField:
+        """Its colours and densities, or its scalars, as they are now, detached."""
+        return self.reconstruction.field()
+
+    def picture(self, view: int | None = None) -> Picture:
+        """Renders a view of the capture as it looks now.
+
+        Args:
+            view: Its index; default: the last one that was learned from.
+        """
+        return self.reconstruction.picture(view)
 
 
 @dataclass(frozen=True)

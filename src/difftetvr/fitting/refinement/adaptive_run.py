@@ -13,11 +13,13 @@ from difftetvr.errors import FitError
 from difftetvr.fitting.positions import VertexOptimizer
 from difftetvr.fitting.records.checkpoint import Checkpoint
 from difftetvr.fitting.records.history import History, RefinementRecord
-from difftetvr.fitting.records.result import Progress
+from difftetvr.fitting.records.result import Picture, Progress
 from difftetvr.fitting.records.unread import Unread
 from difftetvr.fitting.refinement.strategy import EmptySpace, Model, Moment, Refinement, Situation, Strategy
 from difftetvr.mesh.changes.change import MeshChange
+from difftetvr.mesh.field import Field
 from difftetvr.mesh.tetmesh import TetMesh
+from difftetvr.rendering import ScalarField
 
 _GLANCE_VIEWS = 4
 _POSITIONS = "positions."  # prefix of the positions' state in a checkpoint
@@ -67,7 +69,33 @@ class AdaptiveRun:
             refinements=len(history.refinements),
             last_refinement=history.refinements[-1] if history.refinements else None,
             seconds=seconds,
+            glanced_views=self._glanced_views(),
+            glanced_at=history.evaluations[-1][0] if history.evaluations else None,
+            reconstruction=self,
         )
+
+    def field(self) -> Field | ScalarField:
+        """What is on the mesh as it is now, detached."""
+        raise NotImplementedError
+
+    def picture(self, view: int | None = None) -> Picture:
+        """A view as it looks now, see `difftetvr.fitting.Progress.picture`.
+
+        Raises:
+            FitError: There is no such view.
+        """
+        count = len(self._train_views) + len(self._test_views)
+        if view is None:
+            last = self.config.views_at(max(0, self.iteration - 1), len(self._train_views))
+            view = self._train_views[last[-1]]
+        elif not 0 <= view < count:
+            raise FitError(f"There is no view {view}; name one of 0 to {count - 1}.")
+        rendered, truth = self._seen_and_true(view)
+        return Picture(view, rendered.cpu(), truth.cpu())
+
+    def _seen_and_true(self, view: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """Both (H, W, 3), see `Picture`."""
+        raise NotImplementedError
 
     @property
     def _epoch(self) -> int:

@@ -15,7 +15,7 @@ from difftetvr.fitting.beginning.requirements import resolve_device
 from difftetvr.fitting.positions import VertexOptimizer
 from difftetvr.fitting.processes import ALONE
 from difftetvr.fitting.records.checkpoint import Checkpoint, describe_capture, require_same_capture
-from difftetvr.fitting.records.evaluation import Evaluation, compared
+from difftetvr.fitting.records.evaluation import Evaluation, compared, seen_and_true
 from difftetvr.fitting.records.history import History
 from difftetvr.fitting.records.unread import Unread
 from difftetvr.fitting.refinement import Refinement
@@ -129,6 +129,9 @@ class ScalarReconstruction(AdaptiveRun):
 
     def _mean_psnr(self, views: list[int]) -> float | None:
         return self.evaluate(views).mean_psnr
+
+    def _seen_and_true(self, view: int) -> tuple[torch.Tensor, torch.Tensor]:
+        return seen_and_true(self.mesh, self.field(), self._truth, view)
 
     def checkpoint(self) -> Checkpoint:
         """The state, to be saved."""

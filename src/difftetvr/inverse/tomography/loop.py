@@ -134,6 +134,4 @@ def optimise(
         if run.config.solve_steps:
             run.solve(on_solve)
         score = run.score(run.measurements.test)
-    density = run.densities.detached()
-    field = Field(density.new_zeros(len(density), 0), density, "vertex")
-    return TomographyResult(run.mesh, field, score, run.history, run.config, run.alignment)
+    return TomographyResult(run.mesh, run.field(), score, run.history, run.config, run.alignment)

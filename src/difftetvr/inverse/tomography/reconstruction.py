@@ -27,6 +27,7 @@ from difftetvr.inverse.tomography.measurements import Measurements, PixelSet
 from difftetvr.inverse.tomography.objective import Objective
 from difftetvr.inverse.tomography.scoring import ProjectionScore, score_views
 from difftetvr.inverse.tomography.solver import solve
+from difftetvr.mesh.field import Field
 from difftetvr.mesh.making.generators import grid_cubes
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.rendering import render
@@ -140,6 +141,20 @@ class Reconstruction(AdaptiveRun):
 
     def _mean_psnr(self, views: list[int]) -> float | None:
         return self.score(views, _GLANCED_RAYS).mean_psnr
+
+    def field(self) -> Field:
+        """The densities as they are now, detached."""
+        density = self.densities.detached()
+        return Field(density.new_zeros(len(density), 0), density, "vertex")
+
+    @torch.no_grad()
+    def _seen_and_true(self, view: int) -> tuple[torch.Tensor, torch.Tensor]:
+        scan = self.measurements
+        part = self._fixed(view, scan.all_pixels)
+        found = render(self.mesh, self.field(), part.camera).optical_depth
+        found = torch.where(part.weight > 0, found, part.measured)
+        rendered, truth = ((each / scan.peak)[..., None].expand(-1, -1, 3) for each in (found, part.measured))
+        return rendered, truth
 
     def checkpoint(self) -> Checkpoint:
         """The state, to be saved."""

@@ -61,10 +61,47 @@ def render_adjoint(
         wanted: What else needs gradients.
         in_order: Whether sums over rays have a certain order, see :mod:`difftetvr.rendering.kernels.shares`.
     """
-    return gradients_by(_AdjointKernel, tracer, image, Asked(vertex_count, wanted, in_order))
+    by = image.image
+    sees_light = by.depth is not None or (by.color is not None and tracer.view.channels > 0)
+    kernel = _LightAdjoint if sees_light else _DepthAdjoint
+    return gradients_by(kernel, tracer, image, Asked(vertex_count, wanted, in_order))
 
 
-class _AdjointKernel(WalkAdjoint):
+class _DepthAdjoint(WalkAdjoint):
+    """The adjoint of the optical depth alone, which opacity depends on, too: every crossing counts alike."""
+
+    def __init__(self, tracer: Tracer, rays: Lanes, image: ImageAdjoint, gradients: GradientSums) -> None:
+        view = tracer.view
+        backend, pixel, valid = view.backend, rays.pixel, rays.valid
+        *_, optical_depth = view.records.gather(backend, image.light, pixel, valid)
+        gathered = optical_depth, dr.zeros_like(optical_depth)
+        by_pixel = pixel_adjoint(image.image, image.how, view.channels, gathered, pixel, valid)
+        super().__init__(tracer, rays, gradients, by_pixel.color)
+        self.half = 0.5 * by_pixel.optical_depth
+        # Where the walk before stopped.
+        self.last = dr.select(view.threshold > 0, -dr.log(view.threshold), dr.inf)
+
+    def begin(self) -> Any:
+        return dr.zeros(self.view.backend.Float, dr.width(self.rays.pixel))
+
+    def cross(
+        self, start: list[Any], end: list[Any], progress: Any, is_crossed: Any
+    ) -> tuple[Any, list[Any], list[Any]]:
+        (t0, s0, _), (t1, s1, _) = start, end
+        length, none = dr.fmax(t1 - t0, 0.0), dr.zeros_like(t0)
+        d_density = self.half * length
+        d_length = dr.select(is_crossed, self.half * (s0 + s1), 0.0)
+        progress = dr.fma(0.5 * length, s0 + s1, progress)
+        return progress, [-d_length, d_density, none], [d_length, d_density, none]
+
+    def goes_on(self, ray: AdjointRay) -> Any:
+        return (ray.progress < self.last) & (self.half != 0)
+
+    def _radiance(self, channels: list[Any]) -> Any:
+        return self.view.backend.Float(0)
+
+
+class _LightAdjoint(WalkAdjoint):
     """The adjoint of emission and absorption."""
 
     def __init__(self, tracer: Tracer, rays: Lanes, image: ImageAdjoint, gradients: GradientSums) -> None:

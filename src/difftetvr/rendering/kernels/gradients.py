@@ -11,8 +11,9 @@ import drjit as dr
 from difftetvr.backend import Backend
 from difftetvr.recording import few_lengths
 from difftetvr.rendering.traversal.crossing import View
+from difftetvr.rendering.traversal.records import Records
 from difftetvr.rendering.traversal.sums import Copies, Sums
-from difftetvr.rendering.traversal.transfer import TransferGradients
+from difftetvr.rendering.traversal.transfer import KNOT_RECORD
 
 _POSITION = 4  # floats of a record of a position
 
@@ -24,6 +25,7 @@ class Wanted:
     vertices: bool
     limits: bool
     lines: bool = False
+    knots: bool = False
 
 
 @dataclass
@@ -31,12 +33,13 @@ class Gradients:
     """Flat gradients.
 
     Attributes:
-        field: Of at least V vertices, (M, width) records of channels and density, or (M,) densities or scalars; None
-            where cells hold the density.
+        field: Of at least V vertices, (M, width) records of channels and density or scalar; None where cells hold the
+            density, and where vertices hold nothing else and ``vertices`` has it.
         cells: Of at least T cells, (M, width) records of channels and density; None where they hold nothing.
-        vertices: (M, 4): x, y, z in the space of the vertices and padding; None if positions need no gradient.
-        knots: (K,) of the knots of the transfer function; None if there is none.
-        values: (K, 4) of its densities and linear RGB; likewise.
+        vertices: (M, 4): x, y, z in the space of the vertices, and by the density or scalar where ``field`` is None;
+            None if positions need no gradient.
+        knots: (K, 8) of the transfer function: by its knots, densities, linear RGB, and padding; None if there is none,
+            or it needs no gradient.
         limits: (N, 2): the distances between which rays are looked at; None if they need no gradient.
         lines: (N, 6): the rays' origins and directions; None if they need no gradient.
     """
@@ -45,7 +48,6 @@ class Gradients:
     cells: Any | None
     vertices: Any | None
     knots: Any | None
-    values: Any | None
     limits: Any | None
     lines: Any | None
 
@@ -57,7 +59,7 @@ class GradientSums:
     field: Sums | None
     cells: Sums | None
     vertices: Sums | None
-    transfer: TransferGradients | None
+    knots: Sums | None
     limits: Any | None
     lines: Any | None
 
@@ -73,35 +75,30 @@ class GradientSums:
             copies: What :meth:`BufferSizes.places` says about them.
             mode: How additions of several rays to one record are reduced.
         """
-        field, cells, vertices, knots, values = (
+        summed: Any = (
             None if size is None else Sums.zeros(backend, size, places, mode)
             for size, places in zip(sizes.summed, copies, strict=True)
         )
-        return GradientSums(
-            field,
-            cells,
-            vertices,
-            None if knots is None or values is None else TransferGradients(knots, values),
-            *(None if size is None else dr.zeros(backend.Float, size) for size in (sizes.limits, sizes.lines)),
-        )
+        ends = (None if size is None else dr.zeros(backend.Float, size) for size in (sizes.limits, sizes.lines))
+        return GradientSums(*summed, *ends)
 
     def of_copy(self, copy: Any | None) -> GradientSums:
         """The same for lanes that each add to a copy of their own."""
-        field, cells, vertices = (
-            None if sums is None else sums.of_copy(copy) for sums in (self.field, self.cells, self.vertices)
-        )
-        transfer = self.transfer
-        if transfer is not None:
-            transfer = TransferGradients(transfer.knots.of_copy(copy), transfer.values.of_copy(copy))
-        return GradientSums(field, cells, vertices, transfer, self.limits, self.lines)
+        summed: Any = (None if sums is None else sums.of_copy(copy) for sums in self._summed)
+        return GradientSums(*summed, *self._stored)
 
     def total(self) -> Gradients:
         """The sums of all copies."""
-        transfer = self.transfer
-        parts = [self.field, self.cells, self.vertices]
-        parts += [None, None] if transfer is None else [transfer.knots, transfer.values]
-        field, cells, vertices, knots, values = (None if part is None else part.total() for part in parts)
-        return Gradients(field, cells, vertices, knots, values, self.limits, self.lines)
+        totals: Any = (None if sums is None else sums.total() for sums in self._summed)
+        return Gradients(*totals, *self._stored)
+
+    @property
+    def _summed(self) -> tuple[Sums | None, ...]:
+        return self.field, self.cells, self.vertices, self.knots
+
+    @property
+    def _stored(self) -> tuple[Any | None, ...]:
+        return self.limits, self.lines
 
 
 @dataclass(frozen=True)
@@ -109,43 +106,38 @@ class BufferSizes:
     """Floats in each of the buffers of :class:`Gradients`, None for those that are not there.
 
     Attributes:
-        width: Floats in a record of ``field`` and ``cells``.
+        widths: Floats in a record of each of those that many rays add to.
     """
 
     field: int | None
     cells: int | None
     vertices: int | None
     knots: int | None
-    values: int | None
     limits: int | None
     lines: int | None
-    width: int
+    widths: tuple[int, ...]
 
     @staticmethod
     def of(view: View, vertex_count: int, wanted: Wanted) -> BufferSizes:
         """Sizes for a view of V vertices; few different ones, for kernels are compiled for them."""
-        transfer = view.transfer
-        width = view.records.width if view.has_vertex_channels or view.cells is not None else 1
-        field = None if view.has_cell_density else width if view.has_vertex_channels else 1
-        if field is not None:
-            field *= few_lengths(vertex_count)
-        cells = None if view.cells is None else width * few_lengths(dr.width(view.cells) // width)
-        vertices = _POSITION * few_lengths(vertex_count) if wanted.vertices else None
+        vertices, records = few_lengths(vertex_count), view.records
+        has_field = view.has_vertex_channels or not (view.has_cell_density or wanted.vertices)
+        field = records.width_of_sums if view.has_vertex_channels else Records(0).width_of_sums
+        cells = None if view.cells is None else few_lengths(dr.width(view.cells) // records.width)
         return BufferSizes(
-            field,
-            cells,
-            vertices,
-            knots=None if transfer is None else dr.width(transfer.knots),
-            values=None if transfer is None else dr.width(transfer.values),
+            field * vertices if has_field else None,
+            None if cells is None else records.width_of_sums * cells,
+            _POSITION * vertices if wanted.vertices else None,
+            knots=KNOT_RECORD * dr.width(view.transfer.knots) if view.transfer is not None and wanted.knots else None,
             limits=2 * view.rays.count if wanted.limits else None,
             lines=6 * view.rays.count if wanted.lines else None,
-            width=width,
+            widths=(field, records.width_of_sums, _POSITION, KNOT_RECORD),
         )
 
     @property
     def summed(self) -> tuple[int | None, ...]:
         """Sizes of the buffers that many rays add to."""
-        return self.field, self.cells, self.vertices, self.knots, self.values
+        return self.field, self.cells, self.vertices, self.knots
 
     @property
     def floats(self) -> int:
@@ -154,5 +146,5 @@ class BufferSizes:
 
     def places(self, backend: Backend, copies: int) -> list[Copies | None]:
         """Where so many copies of these are; None where there is but one."""
-        pairs = zip(self.summed, (self.width, self.width, _POSITION, 1, 1), strict=True)
+        pairs = zip(self.summed, self.widths, strict=True)
         return [None if size is None else Copies.of(backend, copies, size, width) for size, width in pairs]

@@ -129,7 +129,8 @@ class GradientSource:
     Attributes:
         backend: Array types.
         order: (V,) or (T,) the caller's number of each vertex or cell.
-        vectors: (V, 4) by positions in the space of the rays, and padding; None if not wanted.
+        vectors: (V, 4) by positions in the space of the rays, and by the value where there are no records; None if not
+            wanted.
         pose: (4, 4) rigid transform to that space, None where callers' positions are in it.
         records: By channels and the value behind them; None if not wanted.
         channels: Number of channels C.
@@ -166,8 +167,11 @@ def collect(source: GradientSource, length: int) -> tuple[Any | None, Any | None
             ]
         positions = dr.empty(real, 3 * length)
         dr.scatter(positions, backend.Floats(vector), order)
+        if source.records is None:
+            values = dr.empty(real, length)
+            dr.scatter(values, packet[3], order)
     if source.records is not None:
-        *by_channel, by_value = Records(source.channels).gather(backend, source.records, place)
+        *by_channel, by_value = Records(source.channels).gather_sums(backend, source.records, place)
         channels, values = dr.empty(real, max(source.channels, 1) * length), dr.empty(real, length)
         if by_channel:
             dr.scatter(channels, backend.Floats(by_channel), order)

@@ -175,8 +175,8 @@ class WalkAdjoint:
         Returns:
             The new progress, and derivatives with respect to distance, scalar and the cell's radiance at both ends.
         """
-        transfer, gradients = self.view.transfer, self.gradients.transfer
-        assert transfer is not None and gradients is not None
+        transfer = self.view.transfer
+        assert transfer is not None
         # A jump's piece has no length, but moves with the jump.
         is_crossed = end[0] > start[0]
         color = self.color if radiance is None else []
@@ -188,7 +188,7 @@ class WalkAdjoint:
                 for v in (piece.start_values, piece.end_values)
             ]
             progress, at_start, at_end = self.cross(ends[0], ends[1], progress, is_crossed)
-            adjoint = PieceAdjoint(transfer, piece, start, end, gradients)
+            adjoint = PieceAdjoint(transfer, piece, start, end, self.gradients.knots)
             return progress, adjoint.add(at_start, at_end, color, total), seen + at_start[2] + at_end[2]
 
         zeros = [[dr.zeros_like(start[0]) for _ in range(2)] for _ in range(2)]
@@ -237,14 +237,14 @@ class WalkAdjoint:
         return [*moved, dr.fma(distance, slope_a, line[3]), dr.fma(distance, slope_b, line[4])]
 
     def _scatter(self, vertex: Any, adjoints: list[Any], active: Any) -> None:
-        if self.field_slots == 1:
-            assert self.gradients.field is not None
-            self.gradients.field.add(adjoints[0], vertex, active)
-        elif self.field_slots:
-            self._scatter_record(self.gradients.field, vertex, adjoints[0], adjoints[1], active)
+        value, position = adjoints[: self.field_slots], adjoints[self.field_slots :]
+        if self.field_slots == 2:
+            self._scatter_record(self.gradients.field, vertex, value[0], value[1], active)
+        elif self.gradients.field is not None:
+            self.gradients.field.add(self.view.backend.Float2(*value, 0.0), vertex, active)
         if self.gradients.vertices is not None:
-            position = self.rays.frame.unproject(*adjoints[self.field_slots :])
-            record = self.view.backend.Float4(*position, 0.0)
+            beside = value[0] if self.field_slots == 1 else 0.0
+            record = self.view.backend.Float4(*self.rays.frame.unproject(*position), beside)
             self.gradients.vertices.add(record, vertex, active)
 
     def _scatter_record(self, sums: Any, index: Any, density: Any, radiance: Any, active: Any) -> None:

@@ -88,7 +88,8 @@ class _ProfileFunction(torch.autograd.Function):
         else:
             questions, weights = g_answers * density, g_answers
         needs_vertices, needs_pose, needs_limits, needs_lines, _, *needs_parts = ctx.needs_input_grad[3:]
-        wanted = Wanted(needs_vertices or needs_pose, needs_limits, needs_lines)
+        needs_knots = task.content == "scalar" and any(needs_parts[-2:])
+        wanted = Wanted(needs_vertices or needs_pose, needs_limits, needs_lines, needs_knots)
         if not (wanted.vertices or wanted.limits or wanted.lines or any(needs_parts)):
             return *(None for _ in range(7)), questions, *(None for _ in needs_parts)
         ahead = weights.flip(1).cumsum(1).flip(1)

@@ -34,6 +34,11 @@ class Records:
         """Floats a record; one alone needs no packet."""
         return PACKET * packets_of(self.channels + 1) if self.channels else 1
 
+    @property
+    def width_of_sums(self) -> int:
+        """Floats a record of sums: on CPUs, adding a single float takes several times as long as adding a pair."""
+        return max(self.width, 2)
+
     def gather(self, backend: Backend, array: Any, index: Any, active: Any = True) -> list[Any]:
         """The channels of a record, and the value behind them."""
         if not self.channels:
@@ -45,8 +50,14 @@ class Records:
         dr.scatter(array, self._whole(backend, values), index, active)
 
     def add(self, backend: Backend, sums: Sums, values: list[Any], index: Any, active: Any) -> None:
-        """Add to a record."""
-        sums.add(self._whole(backend, values), index, active)
+        """Add to a record of sums."""
+        sums.add(self._whole(backend, values) if self.channels else backend.Float2(*values, 0.0), index, active)
+
+    def gather_sums(self, backend: Backend, array: Any, index: Any) -> list[Any]:
+        """The channels of a record of sums, and the value behind them."""
+        if not self.channels:
+            return [dr.gather(backend.Float2, array, index)[0]]
+        return self.gather(backend, array, index)
 
     def _whole(self, backend: Backend, values: list[Any]) -> Any:
         # In one piece: several scatters to one array are kernels of their own, each of which computes everything.

@@ -61,7 +61,7 @@ class Sums:
         return replace(self, copy=copy)
 
     def add(self, record: Any, index: Any, active: Any = True) -> None:
-        """Add a float or a packet to a record."""
+        """Add a packet to a record: of 2, 4, 8 or 16 floats, for others Dr.Jit takes several times as long."""
         if self.copies is not None:
             index = dr.fma(self.copy, self.copies.records, index)
         dr.scatter_add(self.buffer, record, index, active, mode=self.mode)

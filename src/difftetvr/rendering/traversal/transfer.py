@@ -189,12 +189,8 @@ class Piece:
         return Piece(lower, upper, change, inverse_width, begin, end, (weights[0], weights[1]), ends[0], ends[1])
 
 
-@dataclass
-class TransferGradients:
-    """Gradients of (K,) knots and of (K, 4) densities and linear RGB; K floats and 4 K are the records."""
-
-    knots: Sums
-    values: Sums
+KNOT_RECORD = 8
+"""Floats of the sums of a knot: derivatives by its place, its density and linear RGB, and padding."""
 
 
 @dataclass
@@ -214,8 +210,17 @@ class PieceAdjoint:
         piece: Piece,
         entry: list[Any],
         leaving: list[Any],
-        gradients: TransferGradients,
+        gradients: Sums | None,
     ) -> None:
+        """Begin.
+
+        Args:
+            transfer: The function.
+            piece: A piece of a crossing.
+            entry: Distance and scalar where the crossing begins.
+            leaving: The same where it ends.
+            gradients: What to add to for the knots; None where they need none.
+        """
         self.transfer, self.piece, self.gradients = transfer, piece, gradients
         (t0, f0), (t1, f1) = entry, leaving
         self.speed = (t1 - t0) * _inverse(f1 - f0)
@@ -265,8 +270,9 @@ class PieceAdjoint:
                 leaving[1] += slope
             else:
                 entry[1] += slope
-        self._scatter(piece.lower, low, knot_low, pixel)
-        self._scatter(piece.upper, high, knot_high, pixel)
+        if self.gradients is not None:
+            self._scatter(self.gradients, piece.lower, [knot_low, *low], pixel)
+            self._scatter(self.gradients, piece.upper, [knot_high, *high], pixel)
         return CrossingAdjoint(entry, leaving)
 
     def _is_held(self, place: PieceEnd) -> Any:
@@ -282,11 +288,12 @@ class PieceAdjoint:
         precedes = after & (transfer.knot(place.knot + 1, after) == place.scalar)
         return (at_least & precedes & ~follows) | (at_greatest & follows & ~precedes)
 
-    def _scatter(self, knot: Any, values: list[Any], position: Any, pixel: list[Any]) -> None:
-        record = [values[0], *(values[1] * g for g in pixel)]
-        self.gradients.knots.add(position, knot)
-        for k, value in enumerate(record):
-            self.gradients.values.add(value, 4 * knot + k)
+    def _scatter(self, gradients: Sums, knot: Any, values: list[Any], pixel: list[Any]) -> None:
+        """Add derivatives by a knot's place, its density, and the radiance <pixel, RGB> there."""
+        place, density, radiance = values
+        record = [place, density, *(radiance * g for g in pixel)]
+        record += [dr.zeros_like(place)] * (KNOT_RECORD - len(record))
+        gradients.add(self.transfer.backend.Floats(record), knot)
 
 
 def _inverse(difference: Any) -> Any:
