@@ -31,7 +31,7 @@ COMMANDS = {
     "fit": "fit.Fit",
     "mesh": "mesh.Mesh",
     "render": "render.Render",
-    "view": "view.View",
+    "view": "live.view.View",
     "compare": "pictures.Compare",
     "cut": "pictures.Cut",
     "fit-transfer": "inverse.fit_transfer.FitTransfer",

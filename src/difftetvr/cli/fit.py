@@ -15,7 +15,7 @@ import tyro
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from difftetvr.cli.arguments import Groups
-from difftetvr.cli.inverse.run_command import WatchOptions
+from difftetvr.cli.live.watching import WATCH_GROUP, WatchOptions
 from difftetvr.cli.options import CAPTURE_GROUPS, CaptureOptions, TrustOptions
 from difftetvr.cli.saved import SavedRun, saved_run
 from difftetvr.errors import DiffTetError, FitError, counted
@@ -71,7 +71,7 @@ class Fit:
         ),
         "Cameras that are not known well": ("refine-poses", "refine-intrinsics", "cameras.*"),
         **CAPTURE_GROUPS,
-        "Output": ("evaluate-every", "checkpoint-seconds", "tensorboard"),
+        "Output": ("evaluate-every", "checkpoint-seconds", *WATCH_GROUP),
     }
 
     def run(self, console: Console) -> None:
@@ -134,7 +134,7 @@ class Fit:
     def _optimise(self, trainer: Trainer, folder: RunFolder, console: Console) -> FitResult:
         from difftetvr.fitting.loop import optimise
 
-        with self.watch.telling(folder, console) as tell:
+        with self.watch.telling(folder, console, trainer.capture) as tell:
             return optimise(trainer, folder.checkpoint, tell)
 
     def to_json(self) -> dict[str, Any]:

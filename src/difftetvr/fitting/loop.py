@@ -171,8 +171,8 @@ class Run(Protocol):
     def glance(self) -> None:
         """Notes how held-out views look, for the curves."""
 
-    def progress(self, seconds: float) -> Any:
-        """A summary for a display."""
+    def progress(self, seconds: float, is_interrupted: Callable[[], bool]) -> Any:
+        """A summary for a display, which may hold the run up until it is interrupted."""
         ...
 
     def checkpoint(self) -> Checkpoint:
@@ -210,7 +210,9 @@ def iterate(trainer: Run, path: Path | None, on_progress: Callable[[Any], None] 
                 trainer.glance()
             history.seconds = time.perf_counter() - start
             if on_progress is not None:
-                on_progress(trainer.progress(history.seconds))
+                watched = time.perf_counter()
+                on_progress(trainer.progress(history.seconds, lambda: interrupt.raised))
+                start += time.perf_counter() - watched  # looking at a run, or holding it up, is no part of it
             due = time.perf_counter() - saved >= config.checkpoint_seconds
             if file is not None and (due or last):
                 trainer.checkpoint().save(file)

@@ -12,7 +12,8 @@ import tyro
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from difftetvr.cli.arguments import Groups
-from difftetvr.cli.inverse.run_command import Begun, RunCommand, WatchOptions
+from difftetvr.cli.inverse.run_command import Begun, RunCommand
+from difftetvr.cli.live.watching import WATCH_GROUP, WatchOptions
 from difftetvr.cli.options import CAPTURE_GROUPS, CaptureOptions, TrustOptions, is_volume
 from difftetvr.cli.saved import folder_to_resume, goes_on_with, saved_options
 from difftetvr.errors import FitError, counted
@@ -73,7 +74,7 @@ class FitScalar(RunCommand):
             *("knots", "function-rate", "seed", "deterministic"),
         ),
         **CAPTURE_GROUPS,
-        "Output": ("evaluate-every", "checkpoint-seconds", "tensorboard"),
+        "Output": ("evaluate-every", "checkpoint-seconds", *WATCH_GROUP),
     }
 
     def begin(self, console: Console, checkpoint: Path | None) -> Begun:
@@ -95,7 +96,13 @@ class FitScalar(RunCommand):
             return self._outcome(result, folder)
 
         options = {"capture": self.capture, "capture_options": views_of.given(), "scalars": run.config.to_json()}
-        return Begun(lambda: run.iteration, options, lambda path, display: optimise(run, path, display), report)
+        return Begun(
+            lambda: run.iteration,
+            options,
+            lambda path, display: optimise(run, path, display),
+            report,
+            images.capture,
+        )
 
     def require_same_run(self, folder: RunFolder) -> None:
         """See `RunCommand.require_same_run`."""

@@ -13,7 +13,8 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from difftetvr.capture.projections.naming import is_projection_source
 from difftetvr.cli.arguments import Groups
-from difftetvr.cli.inverse.run_command import Begun, RunCommand, WatchOptions
+from difftetvr.cli.inverse.run_command import Begun, RunCommand
+from difftetvr.cli.live.watching import WATCH_GROUP, WatchOptions
 from difftetvr.cli.options import TRUST_GROUPS, TrustOptions, saying
 from difftetvr.cli.saved import folder_to_resume, goes_on_with, saved_options
 from difftetvr.errors import FitError, counted
@@ -106,7 +107,7 @@ class FitScan(RunCommand):
         "Optimisation": ("rate", "final-rate", "betas", "seed", "deterministic"),
         "How SCAN is read": ("geometry", "center", "pixel-size", "unit", "gaussian"),
         **TRUST_GROUPS,
-        "Output": ("evaluate-every", "checkpoint-seconds", "tensorboard"),
+        "Output": ("evaluate-every", "checkpoint-seconds", *WATCH_GROUP),
     }
 
     def begin(self, console: Console, checkpoint: Path | None) -> Begun:

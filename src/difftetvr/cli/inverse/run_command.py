@@ -2,69 +2,19 @@
 
 from __future__ import annotations
 
-import contextlib
-import shlex
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from difftetvr.cli.live.watching import WatchOptions
 from difftetvr.fitting.records.folder import RunFolder
 from difftetvr.terminal import waiting
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from difftetvr.fitting.records.result import Progress
-
-
-@dataclass(frozen=True)
-class WatchOptions:
-    """Who is told how a run goes."""
-
-    tensorboard: bool = False
-    """Write curves, held-out pictures and the quality of cells into OUT/tensorboard, for `tensorboard --logdir`."""
-
-    def require(self) -> None:
-        """Checks that they can be told, before anything is read or replaced.
-
-        Raises:
-            FitError: TensorBoard is not installed.
-        """
-        from difftetvr.fitting.records.tensorboard import require_tensorboard
-
-        if self.tensorboard:
-            require_tensorboard()
-
-    @contextlib.contextmanager
-    def telling(self, folder: RunFolder, console: Console) -> Iterator[Callable[[Progress], None]]:
-        """Context of a run that can be gone on with: gives what to call after every iteration.
-
-        Args:
-            folder: The run's.
-            console: Where its progress is shown.
-
-        Raises:
-            FitError: TensorBoard is not installed, or nothing can be written into its folder.
-        """
-        from difftetvr.fitting.records.progress import ProgressDisplay
-        from difftetvr.fitting.records.tensorboard import TensorBoardLogger
-
-        try:
-            with contextlib.ExitStack() as stack:
-                listeners: list[Callable[[Progress], None]] = [stack.enter_context(ProgressDisplay(console))]
-                if self.tensorboard:
-                    listeners.append(stack.enter_context(TensorBoardLogger(folder.logs)))
-
-                def tell(progress: Progress) -> None:
-                    for listener in listeners:
-                        listener(progress)
-
-                yield tell
-        except KeyboardInterrupt:
-            command = shlex.join(["difftetvr", "fit", "-o", str(folder.path), "--resume"])
-            console.print(f"Interrupted; continue with: {command}")
-            raise
+    from difftetvr.capture import Capture
 
 
 @dataclass(frozen=True)
@@ -76,12 +26,14 @@ class Begun:
         options: What its config.json is to hold.
         optimise: Iterates to the end; takes the checkpoint's file and a display of progress.
         report: Writes the result's files into a folder; returns lines that say what came of it.
+        capture: The images that it is about, to be looked at; None where it is about others.
     """
 
     iteration: Callable[[], int]
     options: dict[str, Any]
     optimise: Callable[[Path, Any], Any]
     report: Callable[[RunFolder, Any], list[str]]
+    capture: Capture | None = None
 
 
 class RunCommand:
@@ -132,5 +84,5 @@ class RunCommand:
         console.print("\n".join(lines), highlight=False)
 
     def _optimise(self, begun: Begun, folder: RunFolder, console: Console) -> Any:
-        with self.watch.telling(folder, console) as tell:
+        with self.watch.telling(folder, console, begun.capture) as tell:
             return begun.optimise(folder.checkpoint, tell)

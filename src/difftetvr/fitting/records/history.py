@@ -68,7 +68,9 @@ class History:
         evaluations: Pairs of iteration and mean PSNR in dB over a few held-out views.
         refinements: Every refinement.
         moves: What became of the moves of vertices.
-        seconds: Time spent, over all sessions of the run.
+        budgets: Pairs of iteration and number of cells that the mesh may have from then on, where somebody has changed
+            that while it ran.
+        seconds: Time spent, over all sessions of the run, but for what watching it took.
     """
 
     loss: list[float] = field(default_factory=list)
@@ -76,6 +78,7 @@ class History:
     evaluations: list[tuple[int, float]] = field(default_factory=list)
     refinements: list[RefinementRecord] = field(default_factory=list)
     moves: MoveTotals = field(default_factory=MoveTotals)
+    budgets: list[tuple[int, int]] = field(default_factory=list)
     seconds: float = 0.0
 
     def metrics(self, mesh: TetMesh) -> dict[str, Any]:
@@ -88,6 +91,7 @@ class History:
             "iterations": len(self.loss),
             "moves": dataclasses.asdict(self.moves),
             "refinements": [{**dataclasses.asdict(r), "achieved": r.achieved} for r in self.refinements],
+            **({"budgets": self.budgets} if self.budgets else {}),
             "seconds": self.seconds,
         }
 
@@ -97,6 +101,7 @@ class History:
             "evaluations": self.evaluations,
             "refinements": [dataclasses.asdict(record) for record in self.refinements],
             "moves": dataclasses.asdict(self.moves),
+            "budgets": self.budgets,
             "seconds": self.seconds,
         }
 
@@ -109,5 +114,7 @@ class History:
             [(int(i), float(p)) for i, p in events["evaluations"]],
             [options_from_json(RefinementRecord, record) for record in events["refinements"]],
             options_from_json(MoveTotals, events["moves"]),
+            # Absent from checkpoints of before it could be changed.
+            [(int(i), int(cells)) for i, cells in events.get("budgets", [])],
             float(events["seconds"]),
         )

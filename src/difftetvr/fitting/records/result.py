@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -34,7 +35,15 @@ class Picture:
 
 
 class Reconstruction(Protocol):
-    """What is reconstructed, between two iterations."""
+    """What is reconstructed, between two iterations.
+
+    Attributes:
+        budget: Cells that the mesh may have.
+        strategy: How it is refined; None: not at all.
+    """
+
+    budget: int
+    strategy: Any
 
     @property
     def mesh(self) -> TetMesh:
@@ -49,6 +58,14 @@ class Reconstruction(Protocol):
         """A view as it looks now; default: the last one that was learned from."""
         ...
 
+    def steer(self, budget: int) -> None:
+        """Sets how many cells the mesh may have from the next refinement on."""
+        ...
+
+
+def _never() -> bool:
+    return False
+
 
 @dataclass(frozen=True)
 class Progress:
@@ -56,6 +73,9 @@ class Progress:
 
     Mesh, field and pictures are made when they are asked for, and are what they are then: ask while ``on_progress`` is
     called, and keep the answers, not this.
+
+    Whoever is called may hold the run up, as long as ``is_interrupted`` says no, and may :meth:`steer` it. A run that
+    nobody steers is the same whoever watches it.
 
     Attributes:
         iteration: Iterations done.
@@ -71,6 +91,7 @@ class Progress:
         glanced_views: Held-out views that are looked at from time to time.
         glanced_at: Iterations done when they were looked at last; None before the first time.
         reconstruction: What mesh, field and pictures are asked of.
+        is_interrupted: Tells whether the run has been asked to stop, by a signal; who holds it up, lets it go then.
     """
 
     iteration: int
@@ -86,11 +107,17 @@ class Progress:
     glanced_views: list[int]
     glanced_at: int | None
     reconstruction: Reconstruction = dataclasses.field(repr=False, compare=False)
+    is_interrupted: Callable[[], bool] = dataclasses.field(default=_never, repr=False, compare=False)
 
     @property
     def mesh(self) -> TetMesh:
         """The mesh as it is now, detached."""
         return self.reconstruction.mesh
+
+    @property
+    def budget(self) -> int | None:
+        """Cells that the mesh may have; None where it is not refined."""
+        return self.reconstruction.budget if self.reconstruction.strategy is not None else None
 
     @property
     def field(self) -> Field | ScalarField:
@@ -104,6 +131,17 @@ class Progress:
             view: Its index; default: the last one that was learned from.
         """
         return self.reconstruction.picture(view)
+
+    def steer(self, budget: int) -> None:
+        """Sets how many cells the mesh may have from the next refinement on; the history and checkpoints keep it.
+
+        Args:
+            budget: Cells, at least 1.
+
+        Raises:
+            FitError: It is no such number, the mesh is not refined, or several processes share the run.
+        """
+        self.reconstruction.steer(budget)
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,13 @@ import torch
 from difftetvr.capture.free_space import FreeSpace
 from difftetvr.errors import FitError
 from difftetvr.fitting.positions import VertexOptimizer
+from difftetvr.fitting.processes import Processes
 from difftetvr.fitting.records.checkpoint import Checkpoint
 from difftetvr.fitting.records.history import History, RefinementRecord
 from difftetvr.fitting.records.result import Picture, Progress
 from difftetvr.fitting.records.unread import Unread
 from difftetvr.fitting.refinement.strategy import EmptySpace, Model, Moment, Refinement, Situation, Strategy
+from difftetvr.inputs import as_whole
 from difftetvr.mesh.changes.change import MeshChange
 from difftetvr.mesh.field import Field
 from difftetvr.mesh.tetmesh import TetMesh
@@ -35,6 +37,7 @@ class AdaptiveRun:
         positions: Vertex positions under optimisation; None where they are fixed.
         iteration: Iterations done.
         history: What happened so far.
+        processes: Those that share the run.
     """
 
     config: Any
@@ -43,6 +46,7 @@ class AdaptiveRun:
     positions: VertexOptimizer | None
     iteration: int
     history: History
+    processes: Processes
     _mesh: TetMesh
     _unread: Unread
     _train_views: list[int]
@@ -54,7 +58,7 @@ class AdaptiveRun:
         mesh = self.positions.mesh if self.positions else self._mesh
         return mesh.with_vertices(mesh.vertices.detach())
 
-    def progress(self, seconds: float) -> Progress:
+    def progress(self, seconds: float, is_interrupted: Callable[[], bool]) -> Progress:
         """A summary for a display; loss and PSNR are means over the last pass through the training views."""
         window, history = self._epoch, self.history
         losses, psnrs = history.loss[-window:], history.psnr[-window:]
@@ -72,7 +76,25 @@ class AdaptiveRun:
             glanced_views=self._glanced_views(),
             glanced_at=history.evaluations[-1][0] if history.evaluations else None,
             reconstruction=self,
+            is_interrupted=is_interrupted,
         )
+
+    def steer(self, budget: int) -> None:
+        """Sets how many cells the mesh may have from the next refinement on, see `difftetvr.fitting.Progress.steer`.
+
+        Raises:
+            FitError: It is no number of cells, the mesh is not refined, or several processes share the run.
+        """
+        cells = as_whole(budget, "The number of cells", FitError)
+        if cells < 1:
+            raise FitError(f"The number of cells is {cells}; it must be at least 1.")
+        if self.strategy is None:
+            raise FitError("This run refines no mesh, so it keeps its number of cells; run it with --refine exchange.")
+        if self.processes.count > 1:
+            raise FitError("Several processes share this run, so it keeps its number of cells; run it in one.")
+        if cells != self.budget:
+            self.budget = cells
+            self.history.budgets.append((self.iteration, cells))
 
     def field(self) -> Field | ScalarField:
         """What is on the mesh as it is now, detached."""

@@ -219,7 +219,7 @@ class _Run:
     def glance(self) -> None:
         """Nothing: some dozen knots learn no single view by heart."""
 
-    def progress(self, seconds: float) -> TransferProgress:
+    def progress(self, seconds: float, is_interrupted: Callable[[], bool]) -> TransferProgress:
         loss, psnr = self.history.loss[-1], self.history.psnr[-1]
         return TransferProgress(self.iteration, self.config.iterations, loss, psnr, seconds)
 

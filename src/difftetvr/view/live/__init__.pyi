@@ -9,3 +9,4 @@ from . import server as server
 from . import settings as settings
 from . import shooting as shooting
 from . import studio as studio
+from . import watching as watching

@@ -71,7 +71,7 @@ class LiveServer:
     """
 
     def __init__(self, scene: Scene, listening: Listening) -> None:
-        port = _free_port(listening)
+        port = require_free(listening.host, listening.port)
         self._server = _serving(listening.host, port)
         self._listening = listening
         self.studio = Studio(scene, self._complain)
@@ -114,6 +114,11 @@ class LiveServer:
             f"Open {self.address} in a browser, or port {self._server.get_port()} of this machine from another one: "
             f"anyone in its network can, and can write files to {self._listening.folder}."
         )
+
+    @property
+    def is_watched(self) -> bool:
+        """Whether anybody looks."""
+        return bool(self._windows)
 
     def window_of(self, client: ClientHandle) -> Window:
         """What a client looks through."""
@@ -245,13 +250,16 @@ def _silent() -> Iterator[None]:
         yield
 
 
-def _free_port(listening: Listening) -> int:
+def require_free(host: str, asked: int | None) -> int:
     """The port to listen at.
+
+    Args:
+        host: Address to listen at.
+        asked: Port; None: 8080, or the next one that is free.
 
     Raises:
         DiffTetError: It is taken, or this machine has no such address.
     """
-    host, asked = listening.host, listening.port
     candidates = [asked] if asked is not None else range(PORT, PORT + _PORTS_TRIED)
     problem: OSError | None = None
     for port in candidates:

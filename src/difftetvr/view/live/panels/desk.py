@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from difftetvr.errors import CaptureError, DiffTetError
+from difftetvr.files import require_writable_folder
 from difftetvr.rendering import Camera
 from difftetvr.view.live.placement import Placement, fov_that_holds
 from difftetvr.view.live.studio import Studio
@@ -72,7 +73,7 @@ class Desk:
             suffix: What it ends with; empty for a folder.
 
         Raises:
-            CaptureError: It would lie outside of the folder, is no name, or is there already.
+            CaptureError: It would lie outside of the folder, is no name, is there already, or cannot be written.
         """
         name = name.strip()
         name = name if name.lower().endswith(suffix) else name + suffix
@@ -84,6 +85,8 @@ class Desk:
                 f"'{name}' is no name of a file in {self.folder}, the one folder that is written to; give a name "
                 "without a path."
             )
+        require_writable_folder(self.folder, CaptureError)
+        self.folder.mkdir(parents=True, exist_ok=True)
         if path.exists():
             raise CaptureError(f"{path} is there already, and nothing is replaced; give another name.")
         return path

@@ -11,6 +11,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from difftetvr.cli.arguments import Groups
 from difftetvr.cli.drawing.cameras import CameraOptions, Place
 from difftetvr.cli.drawing.scalars import SCALAR_GROUP, ScalarOptions
+from difftetvr.cli.live.listening import VIEWER_GROUP, ServerOptions
 from difftetvr.cli.options import (
     TRUST_GROUPS,
     CaptureOptions,
@@ -30,28 +31,6 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from difftetvr.view.live.scene import Scene, Views
-
-VIEWER_GROUP = ("host", "port")
-"""Names of the options below."""
-
-
-@dataclass(frozen=True)
-class ServerOptions:
-    """Where the viewer listens."""
-
-    host: str = "127.0.0.1"
-    """Address to listen at; 0.0.0.0: all of this machine, so that anyone in its network can look and save files."""
-    port: int | None = None
-    """Port to listen at; default: 8080, or the next one that is free."""
-
-    def require_valid(self) -> None:
-        """Refuse what can be refused before anything is read.
-
-        Raises:
-            DiffTetError: The port is none.
-        """
-        if self.port is not None and not 0 <= self.port <= 65535:
-            raise DiffTetError(f"--port is {self.port}; it must lie between 0 and 65535.")
 
 
 @dataclass(frozen=True)
@@ -102,7 +81,6 @@ class View:
         require_viewer()
         require_writable_folder(self.output, CaptureError)
         scene = self._scene(resolve_device(self.device), console)
-        self.output.mkdir(parents=True, exist_ok=True)
         with LiveServer(scene, Listening(self.output, self.server.host, self.server.port)) as server:
             console.print(server.announcement, highlight=False, soft_wrap=True)
             console.print(f"What is saved goes to {self.output.resolve()}; stop with Ctrl-C.", highlight=False)
