@@ -2,6 +2,9 @@
 
 import dataclasses
 import io
+import os
+import signal
+import time
 import warnings
 
 import numpy as np
@@ -161,3 +164,81 @@ def test_a_file_in_the_place_of_logs_is_refused(tmp_path):
     folder.logs.touch()
     with pytest.raises(FitError, match="is a file where the folder of logs should be"):
         folder.require_free(resume=False, overwrite=False)
+
+
+GROWING = dataclasses.replace(SMALL, cells=600, iterations=16, exchange=Exchange(rounds=8, views=3))
+
+
+def cells_of(result):
+    return [record.cells for record in result.history.refinements]
+
+
+def test_a_budget_that_is_steered_counts_from_the_next_refinement_on(small_capture, tmp_path):
+    plain = fit(small_capture, GROWING)
+    assert plain.history.budgets == [] and "budgets" not in plain.metrics
+
+    def steer(progress):
+        assert progress.budget == (900 if progress.iteration > 5 else 600)
+        if progress.iteration == 5:
+            progress.steer(900)
+            progress.steer(900)
+
+    more = fit(small_capture, GROWING, on_progress=steer)
+    assert more.history.budgets == [(5, 900)] and more.metrics["budgets"] == [(5, 900)]
+    before = [record.cells for record in more.history.refinements if record.iteration < 5]
+    assert before == cells_of(plain)[: len(before)] and before
+    assert cells_of(more)[-1] > 1.2 * cells_of(plain)[-1] and cells_of(more)[-1] <= 900
+
+
+def test_a_run_goes_on_with_the_budget_that_it_was_steered_to(small_capture, tmp_path):
+    def steer(progress):
+        if progress.iteration == 5:
+            progress.steer(900)
+
+    def break_off(progress):
+        steer(progress)
+        if progress.iteration == 9:
+            raise RuntimeError("killed")
+
+    saved = dataclasses.replace(GROWING, checkpoint_seconds=0.0)
+    whole = fit(small_capture, saved, on_progress=steer)
+    with pytest.raises(RuntimeError, match="killed"):
+        fit(small_capture, saved, checkpoint=tmp_path / "a.safetensors", on_progress=break_off)
+    resumed = fit(small_capture, saved, checkpoint=tmp_path / "a.safetensors", resume=True)
+    assert resumed.history.budgets == [(5, 900)] and same(resumed, whole)
+
+
+def test_what_cannot_be_steered_is_said(small_capture):
+    def wrong(progress):
+        for cells, reason in ((0, "at least 1"), (2.5, "number of cells"), ("many", "number of cells")):
+            with pytest.raises(FitError, match=reason):
+                progress.steer(cells)
+
+    fit(small_capture, dataclasses.replace(SMALL, iterations=1), on_progress=wrong)
+
+    def fixed(progress):
+        assert progress.budget is None
+        with pytest.raises(FitError, match="refines no mesh"):
+            progress.steer(900)
+
+    fit(small_capture, dataclasses.replace(SMALL, iterations=1, refine="none"), on_progress=fixed)
+
+
+def test_who_holds_a_run_up_is_told_of_an_interrupt(small_capture, tmp_path):
+    held = []
+
+    def hold(progress):
+        if progress.iteration == 2:
+            end = time.monotonic() + 30.0
+            os.kill(os.getpid(), signal.SIGINT)
+            while not progress.is_interrupted() and time.monotonic() < end:
+                time.sleep(0.01)
+            held.append(progress.is_interrupted())
+        else:
+            assert not progress.is_interrupted()
+
+    with pytest.raises(KeyboardInterrupt):
+        fit(small_capture, SMALL, checkpoint=tmp_path / "a.safetensors", on_progress=hold)
+    assert held == [True]
+    resumed = fit(small_capture, SMALL, checkpoint=tmp_path / "a.safetensors", resume=True)
+    assert same(resumed, fit(small_capture, SMALL))

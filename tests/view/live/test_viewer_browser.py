@@ -9,12 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 from view.browser import CHROMIUM, Browser
 from view.live import scenes
 
+from difftetvr.capture.camera_paths import load_camera_path
 from difftetvr.errors import DiffTetError
-from difftetvr.rendering import Camera
+from difftetvr.rendering import Camera, load_camera
 from difftetvr.view.cut import Plane, cut_edges
 from difftetvr.view.live.quantities import picture_of
 from difftetvr.view.live.server import Listening, LiveServer
@@ -175,6 +177,40 @@ def test_two_clients_see_the_same_scene_from_their_own_places_and_one_goes_away(
     wait_until(lambda: len(served.clients) == 1)
     served.server.studio.change(mode="color")
     settled(browser, served)
+
+
+def press(browser, text) -> None:
+    """Clicks on the innermost thing with a text: a button, or the head of a folder."""
+    browser.run(f"[...document.querySelectorAll('*')].filter(e => e.textContent.trim() == '{text}').at(-1).click()")
+
+
+def test_pictures_cameras_paths_and_films_are_saved_by_hand(browser, served):
+    settled(browser, served)
+    folder, client = served.server.desk.folder, next(iter(served.clients.values()))
+    for head in ("Save", "Camera path"):
+        press(browser, head)
+        browser.wait_for(f"document.body.innerText.includes('{dict(Save='Save picture').get(head, 'Add this view')}')")
+    press(browser, "Save picture")
+    wait_until(lambda: (folder / "picture-1.png").exists())
+    picture = np.asarray(Image.open(folder / "picture-1.png")).astype(float)
+    assert np.array_equal(picture[:, : SIZE[0] - PANEL], expected(served, client))
+    press(browser, "Save camera")
+    wait_until(lambda: (folder / "camera-1.json").exists())
+    camera = load_camera(folder / "camera-1.json")
+    assert (camera.width, camera.height) == SIZE
+    press(browser, "Add this view")
+    wait_until(lambda: "1 view to run through" in browser.run("document.body.innerText"))
+    served.server.desk.move(client, Camera.look_at((2.0, -7.0, 2.0), scenes.MIDDLE, (0, 0, 1), 0.9, *SIZE))
+    settled(browser, served)
+    press(browser, "Add this view")
+    wait_until(lambda: "2 views to run through" in browser.run("document.body.innerText"))
+    press(browser, "Save path")
+    wait_until(lambda: (folder / "path-1.json").exists())
+    path = load_camera_path(folder / "path-1.json")
+    assert len(path.cameras) == 2 and path.frames == 120
+    assert torch.allclose(path.cameras[0].position, camera.position.double(), atol=1e-4)
+    press(browser, "Clear")
+    assert sorted(file.name for file in folder.iterdir()) == ["camera-1.json", "path-1.json", "picture-1.png"]
 
 
 def resident() -> float:

@@ -116,7 +116,7 @@ def _number(path: str | Path, content: dict[str, Any], name: str) -> float | Non
 
 
 def save_camera_path(path: str | Path, content: CameraPath) -> None:
-    """Writes a camera path in our own format, which :func:`load_camera_path` reads back to the bit.
+    """Writes a camera path in our own format, which `load_camera_path` reads back to the bit.
 
     Args:
         path: File to write.

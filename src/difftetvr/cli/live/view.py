@@ -43,6 +43,8 @@ class View:
     output: Annotated[Path, arg(aliases=["-o"])] = Path()
     """Folder that the viewer may save pictures, films and transfer functions to, and to no other; default: this one."""
     server: OmitArgPrefixes[ServerOptions] = field(default_factory=ServerOptions)
+    camera: Path | None = None
+    """File of the camera to begin with, .json, such as the viewer saves it; default: as render looks at it."""
     capture: str | None = None
     """Capture whose cameras and photographs are shown, too; default: that of the run whose model this is."""
     format: Literal["nerf-synthetic", "transforms", "colmap", "cameras", "tiny-nerf", "polycam", "record3d"] | None = (
@@ -67,7 +69,7 @@ class View:
         "Who can look": VIEWER_GROUP,
         "Photographs": ("capture", "format", "downscale"),
         "Scalars of a simulation, and volumes": SCALAR_GROUP,
-        "How it is drawn": ("background", "renderer", "device"),
+        "How it is drawn": ("camera", "background", "renderer", "device"),
         "How it is read": ("split", "step", "shape", "dtype", "spacing"),
         **TRUST_GROUPS,
     }
@@ -112,7 +114,7 @@ class View:
         if given := self.volume.given():
             raise DiffTetError(f"{self.model} is a mesh, of which --{given[0]} says nothing; leave it out.")
         data = self.mesh.load(self.model, console)
-        place = Place(self.model, CameraOptions(capture=self.capture), console)
+        place = Place(self.model, CameraOptions(camera=self.camera, capture=self.capture), console)
         shown = self.scalars.apply(data, self.model)
         if shown.note is not None:
             console.print(shown.note)
@@ -148,7 +150,7 @@ class View:
         shown = given.apply_to_volume(volume, function)
         look = ScalarLook(shown.function, shown.scale.value_range, shown.density)
         content = VolumeContent(volume, look, device)
-        place = Place(self.model, CameraOptions(), console)
+        place = Place(self.model, CameraOptions(camera=self.camera), console)
         (camera,) = place.shots(content.bounds).cameras
         settings = Settings(background=place.background(self.background), look=look)
         return Scene(self.model.name, content, content.bounds, camera, (0.0, 0.0, 1.0), settings, scalar="value")
@@ -162,10 +164,12 @@ class View:
         name = str(self.model)
         capture = options.sized_for(name, self.device, console).load(name, console)
         cameras = CameraSet(capture.cameras, capture.test, capture.name)
-        place = Place(self.model, CameraOptions(), console)
+        place = Place(self.model, CameraOptions(camera=self.camera), console)
+        bounds, start = capture.bounds.double(), cameras.typical
+        if self.camera is not None:
+            (start,) = place.shots(bounds).cameras
         settings = Settings(background=place.background(self.background))
-        up = tuple(cameras.up.tolist())
-        return Scene(capture.name, None, capture.bounds.double(), cameras.typical, up, settings, Views.of(capture))
+        return Scene(capture.name, None, bounds, start, tuple(cameras.up.tolist()), settings, Views.of(capture))
 
     def _views_of(self, place: Place, console: Console) -> Views | None:
         """The views of the capture that a model comes from; None, with a line that says so, where they are gone."""

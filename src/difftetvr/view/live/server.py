@@ -140,6 +140,7 @@ class LiveServer:
     def _furnish(self, scene: Scene) -> None:
         """Sets up what all windows have in common."""
         server, start = self._server, scene.start
+        server.gui.set_panel_label(scene.title)
         server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         server.scene.set_up_direction(scene.up)
         _, position = self.desk.placement.pose(start)
@@ -151,7 +152,7 @@ class LiveServer:
         initial.near, initial.far = _NEAR, _FAR
         self._show_panel = ShowPanel(self.desk)
         if scene.settings.look is not None:
-            FunctionPanel(self.desk, scene.settings.look, scene.scalar or "")
+            FunctionPanel(self.desk, scene.settings.look, scene.scalar or "scalars")
         if scene.content is not None:
             self.clip_panel = ClipPanel(self.desk)
         if scene.views is not None:
@@ -213,7 +214,7 @@ def _serving(host: str, port: int) -> ViserServer:
             return None
 
     with _silent():
-        server = Server(host=host, port=port, label="DiffTetVR", verbose=False)
+        server = Server(host=host, port=port, verbose=False)
     _refuse_strangers(server, is_local=host in _OWN)
     if server.get_port() != port:
         server.stop()

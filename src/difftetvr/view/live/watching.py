@@ -42,8 +42,7 @@ class RunWatcher:
     def __init__(self, listening: Listening, scene_of: Callable[[Progress], Scene], say: Callable[[str], None]) -> None:
         self._listening, self._scene_of, self._say = listening, scene_of, say
         self._open: tuple[LiveServer, RunPanel] | None = None
-        self._refreshed = self._left = 0.0
-        self._left_over = 0.0
+        self._refreshed = self._left = self._left_over = 0.0
 
     def __enter__(self) -> RunWatcher:
         return self
@@ -54,6 +53,11 @@ class RunWatcher:
         if self._open is not None:
             self._open[0].close()
             self._open = None
+
+    @property
+    def shown(self) -> tuple[LiveServer, RunPanel] | None:
+        """What serves the pages, and their panel of the run; None before the first iteration."""
+        return self._open
 
     def __call__(self, progress: Progress) -> None:
         """Draws for those who look, does what they ask, and waits as long as they want the run to pause."""

@@ -5,3 +5,5 @@ from . import run as run
 from . import save as save
 from . import show as show
 from . import views as views
+
+__all__: list[str] = []

@@ -34,7 +34,7 @@ class FunctionPanel:
         self._edited = EditedFunction.of(look.transfer_function)
         self._chosen, self._alone = 0, threading.Lock()
         gui = desk.server.gui
-        with gui.add_folder("Transfer function"):
+        with gui.add_folder(f"Transfer function of {scalar}"):
             self._drawing = gui.add_html(self._edited.drawing(0))
             self._places = gui.add_multi_slider("Knots", 0.0, 1.0, _STEP, self._edited.places)
             self._knot = gui.add_slider("Chosen", 1, len(self._edited.places), 1, 1)
@@ -53,7 +53,6 @@ class FunctionPanel:
         self._range.on_update(self._edits(self._stretch))
         self._density.on_update(self._edits(self._thicken))
         self._save.on_click(desk.guarded(self._write))
-        self._scalar = scalar
 
     def _edits(self, edit: Any) -> Any:
         """A callback that changes the look, one at a time; what it sets of the panel itself, no client has set."""

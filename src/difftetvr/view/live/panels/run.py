@@ -46,6 +46,15 @@ class RunPanel:
         """Whether the run is to wait."""
         return bool(self._pause.value)
 
+    def hold(self, is_paused: bool) -> None:
+        """Has the run wait, or go on, as a hand would."""
+        self._pause.value = is_paused
+
+    def ask(self, cells: int) -> None:
+        """Asks for another number of cells, as a hand would."""
+        self._cells.value = cells
+        self._asked = cells
+
     def take_budget(self) -> int | None:
         """How many cells the mesh is to have at most, if that has been changed; once."""
         asked, self._asked = self._asked, None
@@ -90,7 +99,7 @@ class _Curve:
     def __init__(self, desk: Desk, label: str, color: str) -> None:
         self._points: list[tuple[float, float]] = []
         self._plot = desk.server.gui.add_uplot(
-            (np.zeros(1), np.zeros(1)),
+            (np.arange(2.0), np.zeros(2)),  # bounds in x are kept in proportion to these
             ({"label": "iteration"}, {"label": label, "stroke": color, "width": 1.5}),
             scales={"x": {"time": False}},
             aspect=2.2,
