@@ -1,4 +1,4 @@
-"""What bundles of rays cost beside a pinhole camera, channels beside colours, and values at places.
+"""What bundles of rays cost beside a pinhole camera, channels and scalars beside colours, and values at places.
 
 A grid of cubes, six cells each, with random colours and densities on its vertices; 65 536 rays from outside, and as
 many from a point inside. All pairs that are compared alternate in one process; best of some repetitions after one that
@@ -20,6 +20,7 @@ from rich.table import Table
 import difftetvr as dtv
 
 SIDE = 256
+KNOTS = 16
 Passes = tuple[float, float]
 
 
@@ -30,6 +31,20 @@ def passes(mesh: dtv.TetMesh, field: dtv.Field, view: dtv.Camera | dtv.Rays) -> 
     image = dtv.render(mesh.with_vertices(leaves[0]), dtv.Field(leaves[1], leaves[2]), view)
     middle = time.perf_counter()
     (image.color.sum() + image.optical_depth.sum()).backward()
+    return middle - start, time.perf_counter() - middle
+
+
+def passes_of_scalars(
+    mesh: dtv.TetMesh, scalar: torch.Tensor, function: dtv.TransferFunction, camera: dtv.Camera, learns_function: bool
+) -> Passes:
+    """The same of scalars behind a transfer function, which is known or wants derivatives, too."""
+    leaves = [part.detach().clone().requires_grad_() for part in (mesh.vertices, scalar)]
+    parts = [part.detach().clone().requires_grad_(learns_function) for part in (function.opacity, function.color)]
+    start = time.perf_counter()
+    seen = dtv.ScalarField(leaves[1], dtv.TransferFunction(function.scalar, *parts), 3.0, (0.0, 1.0))
+    image = dtv.render(mesh.with_vertices(leaves[0]), seen, camera)
+    middle = time.perf_counter()
+    image.color.sum().backward()
     return middle - start, time.perf_counter() - middle
 
 
@@ -73,6 +88,12 @@ def main() -> None:
         show(console, name, best(found, options.repetitions))
     channels = {f"{c} channels": lambda field=field: passes(mesh, field, outside) for c, field in fields.items()}
     show(console, "channels", best(channels, options.repetitions))
+    knots = torch.linspace(0.0, 1.0, KNOTS)
+    function = dtv.TransferFunction(knots, *(torch.rand(shape, generator=generator) for shape in (KNOTS, (KNOTS, 3))))
+    scalars = {"colours and densities": lambda: passes(mesh, fields[3], outside)}
+    for name, learns in (("scalars, a function that is known", False), ("and one that is learned", True)):
+        scalars[name] = lambda learns=learns: passes_of_scalars(mesh, density / 3.0, function, outside, learns)
+    show(console, f"scalars behind a function of {KNOTS} knots", best(scalars, options.repetitions))
     points = torch.rand(1_000_000, 3, generator=generator)
 
     def probed() -> Passes:

@@ -13,6 +13,20 @@ COUNTED = {
 }
 
 
+BUNDLES = {"bundle of rays, image": 1, "bundle of rays that begin among cells, image": 4}
+
+
+@pytest.mark.parametrize("name", BUNDLES)
+def test_bundles_wait_once_where_they_see_all_of_the_mesh(name: str) -> None:
+    if "cuda_emulation.started" not in sys.modules:
+        pytest.skip("a GPU's driver does not count")
+    from cuda_emulation.host_waits import calls, waits_of
+
+    launches, waits = waits_of(calls()[name])
+    assert launches > 0
+    assert waits.total() == BUNDLES[name], waits
+
+
 @pytest.mark.parametrize("name", COUNTED)
 def test_a_rendering_and_its_backward_pass_wait_once(name: str) -> None:
     if "cuda_emulation.started" not in sys.modules:

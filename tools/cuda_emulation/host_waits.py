@@ -80,7 +80,11 @@ def calls() -> dict[str, Callable[[], object]]:
         kinds[f"{renderer}, image"] = fitted(renderer)
         kinds[f"{renderer}, by colours and densities"] = fitted(renderer, "color", "density")
         kinds[f"{renderer}, by vertices, too"] = fitted(renderer, "vertices", "color", "density")
-    kinds["bundle of rays, image"] = fitted("marching", rays=CAMERA.rays())
+    there = CAMERA.rays().to("cuda")
+    kinds["bundle of rays, image"] = fitted("marching", rays=there)
+    kinds["bundle of rays that begin among cells, image"] = fitted(
+        "marching", rays=Rays(0.2 * there.origins, there.directions)
+    )
     kinds["model by hats"] = modelled()
     return kinds
 

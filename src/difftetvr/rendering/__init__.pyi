@@ -7,6 +7,7 @@ from . import gauss_newton as gauss_newton
 from . import inspection as inspection
 from . import kernels as kernels
 from . import preparation as preparation
+from . import prepared_rays as prepared_rays
 from . import quantities as quantities
 from . import rays as rays
 from . import scalar_field as scalar_field

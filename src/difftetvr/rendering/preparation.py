@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeGuard
 
 import torch
 
-from difftetvr.backend import Backend, backend_for, require_own_threads
+from difftetvr.backend import backend_for, require_own_threads
 from difftetvr.errors import DiffTetError, MeshError, shown
 from difftetvr.inputs import as_number, handed_over, require_type
 from difftetvr.mesh import Field, TetMesh
@@ -17,19 +16,19 @@ from difftetvr.optics import ConstantPerCell, ExactLinear, OpticalModel
 from difftetvr.rendering.autograd import Shot
 from difftetvr.rendering.cameras.pinhole import Camera
 from difftetvr.rendering.cell_features import CellFeatures
-from difftetvr.rendering.clip_plane import clip_limits, clip_rays
+from difftetvr.rendering.clip_plane import clip_limits
 from difftetvr.rendering.kernels.layout import LARGEST
+from difftetvr.rendering.prepared_rays import KNOW_FLOAT64, PreparedRays
 from difftetvr.rendering.rays import Rays, RaySource, image_order
 from difftetvr.rendering.scalar_field import ScalarField
 from difftetvr.rendering.task import TRACERS, Content, RenderTask
 from difftetvr.rendering.traversal.crossing import Tracer
 from difftetvr.rendering.traversal.rays import KernelRays
-from difftetvr.rendering.upload import Extent, LaidOut, Upload, lay_out, lay_out_for_camera
+from difftetvr.rendering.upload import Extent, LaidOut, Upload, lay_out, lay_out_for_bundle, lay_out_for_camera
 
 RENDERERS = tuple(TRACERS)
 CAMERAS = "pass a difftetvr.Camera, a list of cameras, or difftetvr.Rays"
 _REMOTE = 64.0  # distances of sizes of the mesh from which float32 loses more than the tests allow it
-_KNOW_FLOAT64 = ("cpu", "cuda")
 _SMALL = 1 / LARGEST  # between these, coordinates are left as they are
 
 
@@ -99,59 +98,6 @@ class PreparedView:
         return self.bundle.limits(clip_plane, origin, self.unit)
 
 
-@dataclass(frozen=True)
-class PreparedRays:
-    """A bundle of rays, each counted from where it is nearest to the mesh's centre: there, float32 resolves most.
-
-    Attributes:
-        lines: (N, 6) origins and unit directions, the origins in the unit of kernels.
-        shift: (N,) how far these origins are from the true ones, in world units.
-        near, far: (N,) distances from the true origins between which rays are looked at, in world units.
-        sees_all: Whether no ray starts or ends near the mesh.
-        origins: (N, 3) the true origins, relative to that of the mesh.
-        directions: (N, 3) unit directions.
-    """
-
-    lines: torch.Tensor
-    shift: torch.Tensor
-    near: torch.Tensor
-    far: torch.Tensor
-    sees_all: bool
-    origins: torch.Tensor
-    directions: torch.Tensor
-
-    @staticmethod
-    def of(rays: Rays, mesh: TetMesh) -> PreparedRays:
-        """Count rays anew from near a mesh; differentiable in them."""
-        device = mesh.vertices.device
-        dtype = torch.float64 if device.type in _KNOW_FLOAT64 else mesh.vertices.dtype
-        rays = rays.relative_to(mesh.origin)
-        directions = rays.directions.reshape(-1, 3).to(device, dtype)
-        # One origin of all is one on the device, too.
-        eye = rays.eye
-        origins = (rays.origins.reshape(-1, 3) if eye is None else eye).to(device, dtype).expand_as(directions)
-        near, far = (end.reshape(-1).to(device, dtype) for end in rays.ends)
-        directions = torch.nn.functional.normalize(directions, dim=1, eps=0.0)
-        low, high = torch.aminmax(mesh.vertices.detach().to(dtype), dim=0)
-        center, radius = 0.5 * (low + high), 0.5 * (high - low).square().sum().sqrt()
-        shift = ((center - origins.detach()) * directions.detach()).sum(1)
-        lines = torch.cat((origins + shift[:, None] * directions, directions), dim=1)
-        beyond = (shift.abs() + radius).mul(1.0 + 1e-5)
-        is_fixed = not (near.requires_grad or far.requires_grad)
-        sees_all = is_fixed and bool(((near <= shift - 1.001 * radius) & (far >= beyond)).all())
-        return PreparedRays(lines, shift, near, far, sees_all, origins, directions)
-
-    def limits(self, clip_plane: Any, origin: Sequence[float], unit: float) -> torch.Tensor | None:
-        """(N, 2) distances from these origins in the unit of kernels; None where nothing is cut off."""
-        if clip_plane is None and self.sees_all:
-            return None
-        near, far = self.near, self.far
-        if clip_plane is not None:
-            first, last = clip_rays(clip_plane, self.origins, self.directions, origin)
-            near, far = torch.maximum(near, first), torch.minimum(far, last)
-        return torch.stack((near - self.shift, far - self.shift), dim=1) / unit
-
-
 def prepare_view(
     mesh: TetMesh, field: Field | ScalarField | CellFeatures, camera: RaySource | Rays, options: ViewOptions
 ) -> PreparedView:
@@ -213,12 +159,18 @@ def _laid_out(task: RenderTask, shape: tuple[int, ...], passed: _Passed, bundle:
     backend = task.backend
     parts = tuple(part.to(backend.dtype) for part in passed.parts)
     if bundle is not None:
-        bundle = _in_unit(bundle, passed.unit, backend)
+        bundle = bundle.in_unit(passed.unit, backend.dtype)
     with backend.exclusive():
         rays: Any = task.rays(None if bundle is None else bundle.lines)
         upload = task.upload(passed.vertices, passed.pose, parts)
-        finds_entries = bundle is None and task.renderer == "marching"
-        laid_out = lay_out_for_camera(upload, rays) if finds_entries else lay_out(upload)
+        if task.renderer != "marching":
+            laid_out = lay_out(upload)
+        elif bundle is None:
+            laid_out = lay_out_for_camera(upload, rays)
+        else:
+            laid_out = lay_out_for_bundle(upload, rays, bundle.sees_all)
+            # Known by now; asked again, the host would wait again.
+            bundle = replace(bundle, sees_all=torch.tensor(laid_out.entries is not None))
     return PreparedView(task, shape, passed.vertices, passed.pose, parts, passed.unit, bundle, rays, upload, laid_out)
 
 
@@ -344,7 +296,7 @@ def _camera_space(mesh: TetMesh, camera: Camera) -> torch.Tensor:
 
 def _is_blurred(extent: Extent, camera: Camera, vertices: torch.Tensor) -> bool:
     """Whether float32 does not resolve what a camera sees of vertices of some extent, and float64 is there."""
-    if vertices.dtype != torch.float32 or vertices.device.type not in _KNOW_FLOAT64:
+    if vertices.dtype != torch.float32 or vertices.device.type not in KNOW_FLOAT64:
         return False
     if _is_remote(extent):
         return True
@@ -372,14 +324,6 @@ def _unit_of_length(vertices: torch.Tensor, mesh: TetMesh) -> tuple[torch.Tensor
         return vertices, 1.0
     unit = 2.0 ** math.frexp(largest)[1]
     return vertices / unit, unit
-
-
-def _in_unit(bundle: PreparedRays, unit: float, backend: Backend) -> PreparedRays:
-    """Rays whose origins are in the unit of kernels, at their precision."""
-    lines = bundle.lines
-    if unit != 1.0:
-        lines = lines * lines.new_tensor([1.0 / unit] * 3 + [1.0] * 3)
-    return replace(bundle, lines=lines.to(backend.dtype))
 
 
 def _parts_by_unit(content: Content, parts: tuple[torch.Tensor, ...], unit: float) -> tuple[torch.Tensor, ...]:

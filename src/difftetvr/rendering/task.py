@@ -13,7 +13,7 @@ from difftetvr.mesh import TetMesh
 from difftetvr.optics import OpticalModel
 from difftetvr.rendering.cameras.pinhole import Camera
 from difftetvr.rendering.kernels.layout import CellSource, VertexSource
-from difftetvr.rendering.search.memory_order import MemoryOrder, OrderedMesh
+from difftetvr.rendering.search.memory_order import MemoryOrder
 from difftetvr.rendering.tracers.aim import Aim
 from difftetvr.rendering.tracers.linked_list import LinkedList
 from difftetvr.rendering.tracers.marching import Marching
@@ -131,8 +131,7 @@ class RenderTask:
             None if limits is None else backend.floats(limits),
             backend.lanes(rays.lane_count),
         )
-        stride, extent = upload.vertices.stride, laid_out.device_extent
-        ordered = OrderedMesh(backend, upload.order, upload.tables, laid_out.records, stride, extent)
+        ordered = upload.ordered(laid_out.records, laid_out.device_extent, laid_out.extent.largest)
         scene = upload.scene(laid_out.records, rays)
         tracer: Tracer = TRACERS[self.renderer].of(Aim(view, scene, ordered, self.mesh, laid_out.entries))
         return tracer

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
+import torch
 
 from difftetvr.backend import Backend
 from difftetvr.mesh import TetMesh
@@ -18,11 +19,13 @@ from difftetvr.rendering.kernels.layout import (
     lay_out_cells,
     lay_out_vertices,
 )
+from difftetvr.rendering.search.bundle_hits import BundleSearch
 from difftetvr.rendering.search.camera_hits import CameraLanes, CameraSearch
 from difftetvr.rendering.search.entry import EntryCounts, EntryLists, count_entries, list_entries
-from difftetvr.rendering.search.memory_order import MemoryOrder, MeshTables
+from difftetvr.rendering.search.memory_order import MemoryOrder, MeshTables, OrderedMesh
 from difftetvr.rendering.search.scene import Scene
 from difftetvr.rendering.search.starts import AROUND, EXTENT, PointStarts
+from difftetvr.rendering.traversal.bundle import BundleRays
 from difftetvr.rendering.traversal.rays import ImageRays
 
 _SUMMARY = EXTENT + 4
@@ -50,6 +53,12 @@ class Upload:
     def lengths(self) -> tuple[int, int]:
         """Numbers of records to make for vertices and cells."""
         return few_lengths(self.mesh.num_vertices), few_lengths(self.mesh.num_cells)
+
+    def ordered(self, records: Any, extent: Any, largest: float | None = None) -> OrderedMesh:
+        """The mesh in the order of memory, with laid out vertices."""
+        return OrderedMesh(
+            self.vertices.backend, self.order, self.tables, records, self.vertices.stride, extent, largest
+        )
 
     def scene(self, records: Any, rays: Any) -> Scene:
         """The cells, with laid out vertices, in the space of some rays."""
@@ -117,16 +126,62 @@ def lay_out_for_camera(upload: Upload, rays: ImageRays, capacity: int = AROUND) 
     backend, tables = upload.vertices.backend, upload.tables
     lanes = CameraLanes.of(backend, rays, tables.faces, upload.mesh.num_cells, capacity)
     found = replayed(_lay_out_and_count, upload.vertices, upload.cells, upload.lengths, tables, rays, lanes)
-    numbers = found.summary.numpy().tolist()
-    most, total, around = int(numbers[EXTENT]), int(numbers[-3]) << 16 | int(numbers[-2]), int(numbers[-1])
+    summary = _Summary.read(found.summary)
+    around = summary.last
     if around > capacity:
         return lay_out_for_camera(upload, rays, few_lengths(around))
     starts = PointStarts(found.around, found.around_count, tables.adjacency, lanes.pixel)
     scene = upload.scene(found.records, rays)
     search = CameraSearch(scene, tables.boundary, lanes.worker, starts, tables.faces, lanes.workers)
-    extent = Extent.of(numbers)
-    entries = list_entries(search, found.counts, most, total, around > 0)
-    return LaidOut(found.records, found.cells, found.extent, extent, entries)
+    entries = list_entries(search, found.counts, summary.most, summary.total, around > 0)
+    return LaidOut(found.records, found.cells, found.extent, summary.extent, entries)
+
+
+def lay_out_for_bundle(upload: Upload, rays: BundleRays, sees_all: torch.Tensor) -> LaidOut:
+    """Lay out a mesh, and find where a bundle's rays enter it if they see all of it; the host waits for both together.
+
+    Args:
+        upload: The mesh, whose cells are joined.
+        rays: The rays.
+        sees_all: Whether no ray starts or ends near the mesh. Where a GPU has still to tell, it is taken for granted
+            until the host has to wait anyhow; if that was wrong, the entries are those of nobody, and not returned.
+    """
+    if not rays.count or (sees_all.device.type == "cpu" and not sees_all):
+        return lay_out(upload)
+    backend = upload.vertices.backend
+    records, cells, extent = replayed(_lay_out, upload.vertices, upload.cells, *upload.lengths)
+    search = BundleSearch.for_entries(upload.scene(records, rays), upload.ordered(records, extent), None)
+    counts = replayed(count_entries, search, rays.count)
+    is_wanted = backend.floats(sees_all.to(backend.device, backend.dtype)[None])
+    summary = _Summary.read(replayed(_summarised, backend, extent, counts, is_wanted))
+    entries = list_entries(search, counts, summary.most, summary.total, False) if summary.last else None
+    return LaidOut(records, cells, extent, summary.extent, entries)
+
+
+@dataclass(frozen=True)
+class _Summary:
+    """What the host has to know before it goes on: the extent, how many entries there are, and one number more."""
+
+    extent: Extent
+    most: int
+    total: int
+    last: int
+
+    @staticmethod
+    def read(numbers: Any) -> _Summary:
+        """From what :func:`_summarised` makes, for which the host waits."""
+        found = numbers.numpy().tolist()
+        return _Summary(Extent.of(found), int(found[EXTENT]), int(found[-3]) << 16 | int(found[-2]), int(found[-1]))
+
+
+def _summarised(backend: Backend, extent: Any, counts: EntryCounts, last: Any) -> Any:
+    """One array, for one wait; halves, for floats do not hold all integers."""
+    summary, total = dr.empty(backend.Float, _SUMMARY), counts.total
+    dr.scatter(summary, extent, dr.arange(backend.UInt, EXTENT))
+    numbers = (counts.most, total >> 16, total & 0xFFFF, last)
+    dr.scatter(summary, backend.Floats([backend.Float(number) for number in numbers]), backend.UInt(EXTENT // 4))
+    dr.eval(summary)
+    return summary
 
 
 def _lay_out(vertices: VertexSource, cells: CellSource | None, vertex_length: int, cell_length: int) -> Any:
@@ -162,10 +217,5 @@ def _lay_out_and_count(
     scene = Scene(backend, records, tables.tets, vertices.stride, rays)
     search = CameraSearch.of(scene, tables, lanes, extent)
     counts = count_entries(search, rays.count)
-    # One array, for one wait; halves, for floats do not hold all integers.
-    summary, total = dr.empty(backend.Float, _SUMMARY), counts.total
-    dr.scatter(summary, extent, dr.arange(backend.UInt, EXTENT))
-    numbers = (counts.most, total >> 16, total & 0xFFFF, search.starts.count)
-    dr.scatter(summary, backend.Floats([backend.Float(number) for number in numbers]), backend.UInt(EXTENT // 4))
-    dr.eval(summary)
+    summary = _summarised(backend, extent, counts, search.starts.count)
     return _Found(records, cell_records, extent, search.starts.cells, search.starts.count, counts, summary)

@@ -162,8 +162,9 @@ class BundleSearch:
 def _starts_at_one_point(scene: Scene, lane: Any, mesh: OrderedMesh, limits: Any) -> PointStarts | None:
     """Cells around the point where all rays begin, which are found once for all of them; None if it is not one."""
     reach = replayed(reach_of_beginnings, scene, lane, limits)
-    ends, extent = (array.numpy()[:6].astype(float) for array in (reach, mesh.extent))
-    spread, size = (ends[0::2] + ends[1::2]).max(), max(abs(ends).max(), abs(extent).max())
+    assert mesh.largest is not None
+    ends = reach.numpy()[:6].astype(float)
+    spread, size = (ends[0::2] + ends[1::2]).max(), max(abs(ends).max(), mesh.largest)
     if not spread <= _ONE_POINT * float(dr.epsilon(scene.backend.Float)) * size:
         return None
     cell = scene.backend.lanes(mesh.order.topology.num_cells)

@@ -55,12 +55,14 @@ class EntryCounts:
         half_faces: (N,) one of them, which is all where no ray has more.
         most: (1,) the greatest number.
         total: (1,) the sum of the numbers.
+        ends: (2,) both, for a host that waits for nothing else.
     """
 
     count: Any
     half_faces: Any
     most: Any
     total: Any
+    ends: Any
 
 
 def count_entries(search: EntrySearch, rays: int) -> EntryCounts:
@@ -73,9 +75,12 @@ def count_entries(search: EntrySearch, rays: int) -> EntryCounts:
         dr.scatter(half_faces, hit.half_face, hit.pixel, hit.is_hit)
 
     search.for_each(visit, lambda: dr.eval(count, half_faces))
-    most, total = dr.max(count), dr.sum(count)
-    dr.eval(most, total)
-    return EntryCounts(count, half_faces, most, total)
+    # Of no rays there is no maximum.
+    most, total = (dr.max(count), dr.sum(count)) if rays else (dr.zeros(uint, 1), dr.zeros(uint, 1))
+    ends = dr.empty(uint, 2)
+    dr.scatter(ends, search.scene.backend.UInt2(most, total), uint(0))
+    dr.eval(most, total, ends)
+    return EntryCounts(count, half_faces, most, total, ends)
 
 
 def list_entries(search: EntrySearch, counts: EntryCounts, most: int, total: int, has_starts: bool) -> EntryLists:
@@ -98,7 +103,8 @@ def list_entries(search: EntrySearch, counts: EntryCounts, most: int, total: int
 def find_entries(search: EntrySearch, has_starts: bool) -> EntryLists:
     """Count and list the entries of every ray."""
     counts = replayed(count_entries, search, search.scene.rays.count)
-    return list_entries(search, counts, int(counts.most[0]), int(counts.total[0]), has_starts)
+    most, total = counts.ends.numpy().tolist()
+    return list_entries(search, counts, most, total, has_starts)
 
 
 def _fill(search: EntrySearch, count: Any, total: int, rays: int) -> tuple[Any, Any]:

@@ -102,6 +102,7 @@ class OrderedMesh:
         records: Flat records of vertices, which begin with x, y and z in the space of the rays.
         stride: Packets of four floats a record.
         extent: Greatest of x, -x, y, -y, z and -z among them, and two numbers more; on the device.
+        largest: Greatest absolute coordinate; None as long as the host does not know it.
     """
 
     backend: Backend
@@ -110,6 +111,7 @@ class OrderedMesh:
     records: Any
     stride: int
     extent: Any
+    largest: float | None
 
     @property
     def positions(self) -> torch.Tensor:
