@@ -11,9 +11,11 @@ from view.live import scenes
 from difftetvr.errors import DiffTetError
 from difftetvr.rendering import Camera, render
 from difftetvr.rendering.inspection import inspect_rays
+from difftetvr.view.live import quantities
 from difftetvr.view.live.pace import FRAME_SECONDS, Pace
 from difftetvr.view.live.placement import Placement, fov_that_holds
 from difftetvr.view.live.quantities import measured, painted, picture_of
+from difftetvr.view.live.scene import Views
 from difftetvr.view.live.studio import Studio
 from difftetvr.view.pictures import to_picture
 
@@ -62,6 +64,23 @@ def test_the_error_at_a_photograph_is_its_own_and_small_beside_it(wrong):
     shifted = seen(scene, "error", aside)[0][..., 0]
     assert abs(float(shifted.nanmean()) - wrong) < 0.06
     assert "error" in scene.modes and "error" not in scenes.colored().modes
+
+
+def test_pixels_of_a_photograph_that_do_not_count_have_no_error():
+    scene = scenes.photographed()
+    capture = scene.views.capture
+    valid = torch.ones(3, 36, 48, dtype=torch.bool)
+    valid[1, :, :24] = False
+    masked = dataclasses.replace(scene, views=Views.of(dataclasses.replace(capture, valid=valid)))
+    is_known = ~seen(masked, "error", scene.views.cameras[1])[0][..., 0].isnan()
+    assert not is_known[:, :23].any() and is_known[1:-1, 25:-1].all()
+
+
+def test_a_large_picture_is_that_of_its_parts(monkeypatch):
+    scene = scenes.colored()
+    whole = np.asarray(picture_of(scene, scene.settings, scenes.START))
+    monkeypatch.setattr(quantities, "_MOST_AT_ONCE", 60 * 7)
+    assert np.array_equal(np.asarray(picture_of(scene, scene.settings, scenes.START)), whole)
 
 
 def test_a_look_changes_scalars():

@@ -1,12 +1,15 @@
 """A run that is looked at: the same bits, pictures of its mesh, pauses, and another number of cells."""
 
 import dataclasses
+import os
+import signal
 import threading
 
 import pytest
 import torch
 
 import difftetvr as dtv
+from difftetvr.fitting.records.checkpoint import Checkpoint
 from difftetvr.fitting.refinement import Exchange
 from difftetvr.view.live.contents import MeshContent
 from difftetvr.view.live.scene import Scene
@@ -28,7 +31,7 @@ def plain(capture):
     return dtv.fit(capture, CONFIG)
 
 
-def watched(capture, folder, at_iteration, config=CONFIG):
+def watched(capture, folder, at_iteration, config=CONFIG, checkpoint=None):
     """The result of a run that is looked at through one window, and what was shown there and said."""
     shown, said = [], []
 
@@ -50,7 +53,7 @@ def watched(capture, folder, at_iteration, config=CONFIG):
                     pass
             at_iteration(progress, server, panel)
 
-        result = dtv.fit(capture, config, on_progress=look)
+        result = dtv.fit(capture, config, checkpoint=checkpoint, on_progress=look)
     assert not (folder / "saved").exists()
     return result, shown, said
 
@@ -80,6 +83,20 @@ def test_a_run_waits_while_it_pauses_and_shows_its_mesh_as_it_is(capture, plain,
     result, _, _ = watched(capture, tmp_path, let_go)
     assert torch.equal(seen["mesh"], seen["there"])  # taken when the pause began, after iteration 7
     assert torch.equal(result.mesh.vertices, plain.mesh.vertices)
+
+
+def test_an_interrupt_ends_a_pause_and_saves_the_run(capture, plain, tmp_path):
+    def hold(progress, server, panel):
+        if progress.iteration == 6:
+            panel.hold(True)
+            threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT)).start()
+
+    path = tmp_path / "a.safetensors"
+    with pytest.raises(KeyboardInterrupt):
+        watched(capture, tmp_path, hold, checkpoint=path)
+    assert Checkpoint.load(path).iteration == 7
+    resumed = dtv.fit(capture, CONFIG, checkpoint=path, resume=True)
+    assert torch.equal(resumed.mesh.vertices, plain.mesh.vertices)
 
 
 def test_a_run_is_given_more_cells(capture, plain, tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -18,6 +19,7 @@ _LEAST_QUALITY = 1e-3
 _LEAST_OPACITY = 1.0 / 255.0  # of pixels whose depth says something
 _TAILS = 0.01  # of the depths at either end that do not stretch the scale
 _MOST_ERROR = 0.25
+_MOST_AT_ONCE = 1 << 20  # pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,8 +73,16 @@ def painted(values: torch.Tensor, settings: Settings) -> Painted:
 
 
 def picture_of(scene: Scene, settings: Settings, camera: Camera) -> Image.Image:
-    """What a camera sees, at once and in full."""
-    return Image.fromarray(painted(measured(scene, settings, camera), settings).pixels)
+    """What a camera sees, in full; of large pictures no more rows at a time than memory is sure to hold."""
+    rows = max(1, _MOST_AT_ONCE // camera.width)
+    bands = [band(camera, first, min(rows, camera.height - first)) for first in range(0, camera.height, rows)]
+    values = torch.cat([measured(scene, settings, part) for part in bands])
+    return Image.fromarray(painted(values, settings).pixels)
+
+
+def band(camera: Camera, first: int, count: int) -> Camera:
+    """The camera of some rows of another one: its rays are theirs."""
+    return dataclasses.replace(camera, cy=camera.cy - first, height=count)
 
 
 def _bytes(colors: torch.Tensor) -> np.ndarray:
@@ -126,6 +136,9 @@ def _error(scene: Scene, settings: Settings, camera: Camera) -> torch.Tensor:
     height, width = photograph.shape[:2]
     column, row = places.unbind(-1)
     is_inside = (enlarged > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    if capture.valid is not None:
+        pixels = (row.clamp(0, height - 1).long(), column.clamp(0, width - 1).long())
+        is_inside &= capture.valid[view][pixels]
     truth = _looked_up(photograph, column, row).reshape(*image.alpha.shape, 3)
     seen = image.color.cpu() + (1.0 - image.alpha.cpu()[..., None]) * _behind(capture.alphas, view, settings)
     error = (seen - truth).abs().mean(-1)

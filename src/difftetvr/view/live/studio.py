@@ -15,7 +15,7 @@ import torch
 from difftetvr.errors import DiffTetError
 from difftetvr.rendering import Camera
 from difftetvr.view.live.pace import Pace
-from difftetvr.view.live.quantities import Painted, measured, painted
+from difftetvr.view.live.quantities import Painted, band, measured, painted
 from difftetvr.view.live.scene import Scene
 from difftetvr.view.live.settings import Settings
 
@@ -142,8 +142,8 @@ class Studio:
                 self._changed.wait(max(left, 1e-3))
         try:
             task()
-        except DiffTetError as error:
-            self._complain(str(error))
+        except (DiffTetError, MemoryError) as error:
+            self._complain(str(error) or "There is not enough memory for this picture; ask for a smaller one.")
         return True
 
     def _restart(self) -> None:
@@ -203,7 +203,7 @@ class Studio:
             bands = self._paces.setdefault(settings.mode, Pace()).bands(camera.width, camera.height)
             count = min(-(-camera.height // bands), camera.height - done)
             start = time.perf_counter()
-            parts = [*before, measured(scene, settings, _band(camera, done, count))]
+            parts = [*before, measured(scene, settings, band(camera, done, count))]
             self._observe(settings, (camera.width, count), time.perf_counter() - start, camera)
             is_whole = done + count == camera.height
             with self._changed:
@@ -233,8 +233,3 @@ def _resized(camera: Camera, width: int, height: int) -> Camera:
     """The same view in other pixels; a hair squeezed where these have not quite the same proportions."""
     x, y = width / camera.width, height / camera.height
     return Camera(camera.world_to_camera, x * camera.fx, y * camera.fy, x * camera.cx, y * camera.cy, width, height)
-
-
-def _band(camera: Camera, first: int, count: int) -> Camera:
-    """The camera of some rows: its rays are those of the whole."""
-    return dataclasses.replace(camera, cy=camera.cy - first, height=count)
