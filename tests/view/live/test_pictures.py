@@ -76,6 +76,15 @@ def test_pixels_of_a_photograph_that_do_not_count_have_no_error():
     assert not is_known[:, :23].any() and is_known[1:-1, 25:-1].all()
 
 
+def test_without_a_model_a_camera_shows_its_photograph_and_other_places_nothing():
+    scene = dataclasses.replace(scenes.photographed(), content=None)
+    capture, camera = scene.views.capture, scene.views.cameras[2]
+    values = seen(scene, "color", camera)[0]
+    known = values[..., 3] > 0
+    assert known[1:-1, 1:-1].all() and (values[..., :3] - capture.images[2])[known].abs().max() < 2e-3
+    assert not seen(scene, "color")[0].any()
+
+
 def test_a_large_picture_is_that_of_its_parts(monkeypatch):
     scene = scenes.colored()
     whole = np.asarray(picture_of(scene, scene.settings, scenes.START))

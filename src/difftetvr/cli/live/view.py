@@ -156,6 +156,8 @@ class View:
         return Scene(self.model.name, content, content.bounds, camera, (0.0, 0.0, 1.0), settings, scalar="value")
 
     def _capture_scene(self, console: Console) -> Scene:
+        import torch
+
         from difftetvr.capture import CameraSet
         from difftetvr.view.live.scene import Scene, Views
         from difftetvr.view.live.settings import Settings
@@ -164,12 +166,14 @@ class View:
         name = str(self.model)
         capture = options.sized_for(name, self.device, console).load(name, console)
         cameras = CameraSet(capture.cameras, capture.test, capture.name)
-        place = Place(self.model, CameraOptions(camera=self.camera), console)
-        bounds, start = capture.bounds.double(), cameras.typical
-        if self.camera is not None:
-            (start,) = place.shots(bounds).cameras
+        up = tuple(cameras.up.tolist())
+        # From outside, so that all cameras are seen: there is nothing else.
+        asked = CameraOptions(camera=self.camera, up=None if self.camera is not None else up)
+        place, positions = Place(self.model, asked, console), torch.from_numpy(cameras.positions)
+        everything = torch.cat((capture.bounds.double(), positions))
+        (start,) = place.shots(torch.stack((everything.amin(0), everything.amax(0)))).cameras
         settings = Settings(background=place.background(self.background))
-        return Scene(capture.name, None, bounds, start, tuple(cameras.up.tolist()), settings, Views.of(capture))
+        return Scene(capture.name, None, capture.bounds.double(), start, up, settings, Views.of(capture))
 
     def _views_of(self, place: Place, console: Console) -> Views | None:
         """The views of the capture that a model comes from; None, with a line that says so, where they are gone."""

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from PIL import Image
 
+from difftetvr.capture import Capture
 from difftetvr.rendering import Camera
 from difftetvr.view.heatmap import Scale, heat_colors
 from difftetvr.view.live.scene import Scene
@@ -19,6 +20,7 @@ _LEAST_QUALITY = 1e-3
 _LEAST_OPACITY = 1.0 / 255.0  # of pixels whose depth says something
 _TAILS = 0.01  # of the depths at either end that do not stretch the scale
 _MOST_ERROR = 0.25
+_IN_PLACE = 0.01  # of the distance to what is looked at that a camera may be off its place
 _MOST_AT_ONCE = 1 << 20  # pixels
 
 
@@ -51,7 +53,7 @@ class Quantity:
 def measured(scene: Scene, settings: Settings, camera: Camera) -> torch.Tensor:
     """(H, W, C) float32 numbers, on the CPU, of which `painted` makes a picture once all rows are there."""
     if scene.content is None:
-        return torch.zeros((camera.height, camera.width, 4))
+        return _photograph(scene, camera)
     with torch.no_grad():
         return QUANTITIES[settings.mode].measure(scene, settings, camera).float().cpu()
 
@@ -125,27 +127,44 @@ def _error(scene: Scene, settings: Settings, camera: Camera) -> torch.Tensor:
     assert scene.content is not None and scene.views is not None and scene.views.capture is not None
     image, capture = scene.content.seen_by(camera, settings), scene.views.capture
     view = scene.views.nearest_to(camera, scene.focus)
-    rays = camera.rays()
     middle = (scene.focus - camera.position.detach().cpu().double()).norm()
-    depth = torch.where(image.alpha >= 0.5, image.depth, middle.to(image.depth))
+    depth = torch.where(image.alpha >= 0.5, image.depth, middle.to(image.depth)).double().cpu()
+    truth, is_known = _seen_in(capture, view, camera, depth)
+    seen = image.color.cpu() + (1.0 - image.alpha.cpu()[..., None]) * _behind(capture.alphas, settings)
+    return torch.where(is_known, (seen - truth).abs().mean(-1), torch.nan)[..., None]
+
+
+def _photograph(scene: Scene, camera: Camera) -> torch.Tensor:
+    """(H, W, 4) the photograph of which a camera stands in the place, and nothing from anywhere else."""
+    nothing = torch.zeros((camera.height, camera.width, 4))
+    if scene.views is None or scene.views.capture is None:
+        return nothing
+    view, place = scene.views.nearest_to(camera, scene.focus), camera.position.detach().cpu().double()
+    distance = (scene.focus - place).norm()
+    aside = (scene.views.cameras[view].position.detach().cpu().double() - place).norm()
+    if aside > _IN_PLACE * distance:
+        return nothing
+    depth = distance.expand(camera.height, camera.width)
+    image, is_known = _seen_in(scene.views.capture, view, camera, depth)
+    return torch.cat((image * is_known[..., None], is_known[..., None].float()), -1)
+
+
+def _seen_in(capture: Capture, view: int, camera: Camera, depth: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """(H, W, 3) what a photograph shows of points at (H, W) depths before a camera, and (H, W) whether it does."""
+    rays = camera.rays()
     origins, directions = (part.detach().double().cpu() for part in (rays.origins, rays.directions))
-    ahead = torch.nn.functional.normalize(directions, dim=-1)
-    points = origins + depth.double().cpu()[..., None] * ahead
+    points = origins + depth[..., None] * torch.nn.functional.normalize(directions, dim=-1)
     places, enlarged = capture.cameras[view].project(points.reshape(-1, 3))
     photograph = capture.images[view].float()
     height, width = photograph.shape[:2]
     column, row = places.unbind(-1)
-    is_inside = (enlarged > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    is_known = (enlarged > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
     if capture.valid is not None:
-        pixels = (row.clamp(0, height - 1).long(), column.clamp(0, width - 1).long())
-        is_inside &= capture.valid[view][pixels]
-    truth = _looked_up(photograph, column, row).reshape(*image.alpha.shape, 3)
-    seen = image.color.cpu() + (1.0 - image.alpha.cpu()[..., None]) * _behind(capture.alphas, view, settings)
-    error = (seen - truth).abs().mean(-1)
-    return torch.where(is_inside.reshape(error.shape), error, torch.nan)[..., None]
+        is_known &= capture.valid[view][row.clamp(0, height - 1).long(), column.clamp(0, width - 1).long()]
+    return _looked_up(photograph, column, row).reshape(*depth.shape, 3), is_known.reshape(depth.shape)
 
 
-def _behind(alphas: object, view: int, settings: Settings) -> torch.Tensor:
+def _behind(alphas: object, settings: Settings) -> torch.Tensor:
     """What is behind a photograph: black where it is cut out, as it is kept over black."""
     return torch.zeros(3) if alphas is not None else torch.tensor(settings.background)
 

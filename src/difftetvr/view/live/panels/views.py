@@ -15,8 +15,8 @@ _ROOT, _POINTS = "/views", "/points"
 _MOST_IMAGES, _IMAGE_SIDE = 300, 96
 _MOST_POINTS = 200_000
 _TRAINING, _HELD_OUT = (90, 150, 240), (250, 160, 40)
-_SHARE = 0.025  # of a camera's distance from what it looks at that its frustum is large
-_HIDDEN = 2.5  # sizes of a frustum that are so near to an eye that they are not drawn: it may be that camera's own
+_SHARE = 0.06  # of a camera's distance from what it looks at that its frustum is long
+_HIDDEN = 1.1  # lengths of a frustum that are so near to an eye that they are not drawn: it may be that camera's own
 
 
 class ViewsPanel:
@@ -54,9 +54,9 @@ class ViewsPanel:
             has_image = views.capture is not None and index % step == 0
             frustum = desk.server.scene.add_camera_frustum(
                 f"{_ROOT}/{index}",
-                2.0 * float(np.arctan(0.5 * camera.height / camera.fy)),
+                2.0 * float(np.arctan(_half_height(camera))),
                 (camera.width / camera.fx) / (camera.height / camera.fy),
-                scale=self._length,
+                scale=self._scale_of(camera),
                 thickness=1.5,
                 thickness_units="screen",
                 color=_HELD_OUT if bool(views.test[index]) else _TRAINING,
@@ -68,6 +68,11 @@ class ViewsPanel:
             frustum.on_click(desk.guarded(partial(self._jump, index)))
             frusta.append(frustum)
         return frusta
+
+    def _scale_of(self, camera: Camera) -> float:
+        """The scale of a frustum that is as long as all are; viser's have the same volume, whatever they see."""
+        half_width = 0.5 * camera.width / camera.fx
+        return self._size.value * self._length * float(np.cbrt(half_width * _half_height(camera) / 3.0))
 
     def _usual_length(self) -> float:
         focus = self._desk.placement.inward(self._desk.studio.scene.focus.numpy())
@@ -93,8 +98,8 @@ class ViewsPanel:
             frustum.visible = self._is_on.value
 
     def _resize(self) -> None:
-        for frustum in self._frusta:
-            frustum.scale = self._size.value * self._length
+        for frustum, camera in zip(self._frusta, self._views.cameras, strict=True):
+            frustum.scale = self._scale_of(camera)
         near = _HIDDEN * self._size.value * self._length
         self._desk.server.initial_camera.near = near
         for client in self._desk.server.get_clients().values():
@@ -109,3 +114,8 @@ class ViewsPanel:
         if event.client is not None:
             camera: Camera = self._desk.camera_of(event.client)
             self._jump(self._views.nearest_to(camera, self._desk.studio.scene.focus), event)
+
+
+def _half_height(camera: Camera) -> float:
+    """Half of the height of an image at distance 1."""
+    return 0.5 * camera.height / camera.fy
