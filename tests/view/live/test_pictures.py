@@ -9,13 +9,16 @@ import torch
 from view.live import scenes
 
 from difftetvr.errors import DiffTetError
+from difftetvr.mesh import Field
 from difftetvr.rendering import Camera, render
 from difftetvr.rendering.inspection import inspect_rays
 from difftetvr.view.live import quantities
+from difftetvr.view.live.contents import MeshContent
 from difftetvr.view.live.pace import FRAME_SECONDS, Pace
 from difftetvr.view.live.placement import Placement, fov_that_holds
 from difftetvr.view.live.quantities import measured, painted, picture_of
 from difftetvr.view.live.scene import Views
+from difftetvr.view.live.settings import Settings
 from difftetvr.view.live.studio import Studio
 from difftetvr.view.pictures import to_picture
 
@@ -90,6 +93,19 @@ def test_a_large_picture_is_that_of_its_parts(monkeypatch):
     whole = np.asarray(picture_of(scene, scene.settings, scenes.START))
     monkeypatch.setattr(quantities, "_MOST_AT_ONCE", 60 * 7)
     assert np.array_equal(np.asarray(picture_of(scene, scene.settings, scenes.START)), whole)
+
+
+@pytest.mark.parametrize("channels", [0, 1, 2, 5])
+def test_fields_of_other_channels_are_seen_as_colours(channels):
+    mesh = scenes.grid()
+    values, density = torch.rand(mesh.num_vertices, channels), torch.rand(mesh.num_vertices)
+    color = MeshContent(mesh, Field(values, density)).seen_by(scenes.START, Settings()).color
+    truth = render(mesh, Field(values, density), scenes.START)
+    if channels < 2:  # white, and grey
+        expected = (truth.color if channels else truth.alpha[..., None]).expand(-1, -1, 3)
+    else:
+        expected = torch.nn.functional.pad(truth.color, (0, 1))[..., :3]
+    assert (color - expected).abs().max() < 1e-5 and color.max() > 0.1
 
 
 def test_a_look_changes_scalars():

@@ -44,6 +44,8 @@ def watched(capture, folder, at_iteration, config=CONFIG, checkpoint=None):
 
         def look(progress):
             watcher(progress)
+            if watcher.shown is None:
+                return
             server, panel = watcher.shown
             if progress.iteration == 1:
                 studio = server.studio
@@ -82,6 +84,20 @@ def test_a_run_waits_while_it_pauses_and_shows_its_mesh_as_it_is(capture, plain,
 
     result, _, _ = watched(capture, tmp_path, let_go)
     assert torch.equal(seen["mesh"], seen["there"])  # taken when the pause began, after iteration 7
+    assert torch.equal(result.mesh.vertices, plain.mesh.vertices)
+
+
+def test_a_picture_that_cannot_be_drawn_ends_the_viewer_and_not_the_run(capture, plain, tmp_path, monkeypatch):
+    def fail(self, camera, settings):
+        raise RuntimeError("no such thing")
+
+    def spoil(progress, server, panel):
+        if progress.iteration == 4:
+            monkeypatch.setattr(MeshContent, "seen_by", fail)
+            panel.hold(True)
+
+    result, _, said = watched(capture, tmp_path, spoil)
+    assert said[-1] == "The viewer has ended, the run goes on without it: no such thing"
     assert torch.equal(result.mesh.vertices, plain.mesh.vertices)
 
 

@@ -41,13 +41,15 @@ class MeshContent:
 
     Args:
         mesh: The mesh, on the device where it is rendered.
-        field: Colours and densities, or scalars; likewise.
+        field: Colours and densities, or scalars; likewise. Densities without colours are white, one channel is grey,
+            and of more than three the first three are seen as red, green and blue.
         renderer: How crossings are found and ordered, see :func:`difftetvr.render`.
     """
 
     modes: tuple[Mode, ...] = ("color", "depth", "opacity", "cell quality", "depth complexity")
 
     def __init__(self, mesh: TetMesh, field: Field | ScalarField, renderer: str = "marching") -> None:
+        field = _in_colors(field) if isinstance(field, Field) else field
         self.mesh, self.field, self._renderer = mesh, field, renderer
         self.bounds = mesh.bounds().detach().double().cpu()
         self._seen: tuple[ScalarLook | None, Field | ScalarField] = (None, field)
@@ -76,6 +78,17 @@ class MeshContent:
             )
             self._seen = (look, field)
         return field
+
+
+def _in_colors(field: Field) -> Field:
+    """A field with red, green and blue."""
+    channels = field.color.shape[1]
+    if channels == 3:
+        return field
+    if channels == 0:
+        return Field(field.color.new_ones((len(field.color), 3)), field.density, field.location)
+    seen = field.color.expand(-1, 3) if channels == 1 else torch.nn.functional.pad(field.color, (0, 1))[:, :3]
+    return Field(seen.contiguous(), field.density, field.location)
 
 
 class VolumeContent:

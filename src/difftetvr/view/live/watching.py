@@ -43,6 +43,7 @@ class RunWatcher:
         self._listening, self._scene_of, self._say = listening, scene_of, say
         self._open: tuple[LiveServer, RunPanel] | None = None
         self._refreshed = self._left = self._left_over = 0.0
+        self._has_failed = False
 
     def __enter__(self) -> RunWatcher:
         return self
@@ -50,6 +51,9 @@ class RunWatcher:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self._close()
+
+    def _close(self) -> None:
         if self._open is not None:
             self._open[0].close()
             self._open = None
@@ -61,7 +65,16 @@ class RunWatcher:
 
     def __call__(self, progress: Progress) -> None:
         """Draws for those who look, does what they ask, and waits as long as they want the run to pause."""
-        server, panel = self._opened(progress)
+        if self._has_failed:
+            return
+        try:
+            self._watch(*self._opened(progress), progress)
+        except Exception as error:  # whatever is wrong with a picture is no reason to lose the run that it is of
+            self._has_failed = True
+            self._say(f"The viewer has ended, the run goes on without it: {' '.join(str(error).split())}")
+            self._close()
+
+    def _watch(self, server: LiveServer, panel: RunPanel, progress: Progress) -> None:
         panel.tell(progress)
         self._steer(panel, progress)
         if server.is_watched:
