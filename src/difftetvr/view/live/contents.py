@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Protocol
 
+import numpy as np
 import torch
 
 from difftetvr.capture import Volume, VolumeRenderer
@@ -12,6 +13,13 @@ from difftetvr.mesh import Field, TetMesh
 from difftetvr.rendering import Camera, RenderedImage, ScalarField, render
 from difftetvr.rendering.inspection import RayStatistics, inspect_rays
 from difftetvr.view.live.settings import Mode, ScalarLook, Settings
+
+_DENSEST = 25.0
+"""Density of the densest of what has no colours, where the longest side is 1, as that of transfer functions."""
+
+
+_ORDINARY = 0.999
+"""Share of the vertices that are no denser than that; the rest are outliers."""
 
 
 class Content(Protocol):
@@ -41,17 +49,18 @@ class MeshContent:
 
     Args:
         mesh: The mesh, on the device where it is rendered.
-        field: Colours and densities, or scalars; likewise. Densities without colours are white, one channel is grey,
-            and of more than three the first three are seen as red, green and blue.
+        field: Colours and densities, or scalars; likewise. Densities without colours are white, and as dense as shows
+            them; one channel is grey, and of more than three the first three are seen as red, green and blue.
         renderer: How crossings are found and ordered, see :func:`difftetvr.render`.
     """
 
     modes: tuple[Mode, ...] = ("color", "depth", "opacity", "cell quality", "depth complexity")
 
     def __init__(self, mesh: TetMesh, field: Field | ScalarField, renderer: str = "marching") -> None:
-        field = _in_colors(field) if isinstance(field, Field) else field
-        self.mesh, self.field, self._renderer = mesh, field, renderer
         self.bounds = mesh.bounds().detach().double().cpu()
+        longest = float((self.bounds[1] - self.bounds[0]).max())
+        field = _in_colors(field, longest) if isinstance(field, Field) else field
+        self.mesh, self.field, self._renderer = mesh, field, renderer
         self._seen: tuple[ScalarLook | None, Field | ScalarField] = (None, field)
 
     def seen_by(self, camera: Camera, settings: Settings) -> RenderedImage:
@@ -80,13 +89,15 @@ class MeshContent:
         return field
 
 
-def _in_colors(field: Field) -> Field:
-    """A field with red, green and blue."""
+def _in_colors(field: Field, longest: float) -> Field:
+    """A field with red, green and blue, for a mesh whose longest side has some length."""
     channels = field.color.shape[1]
     if channels == 3:
         return field
     if channels == 0:
-        return Field(field.color.new_ones((len(field.color), 3)), field.density, field.location)
+        densest = float(np.quantile(field.density.detach().cpu().numpy(), _ORDINARY))
+        factor = _DENSEST / (longest * densest) if densest > 0.0 else 1.0
+        return Field(field.color.new_ones((len(field.color), 3)), factor * field.density, field.location)
     seen = field.color.expand(-1, 3) if channels == 1 else torch.nn.functional.pad(field.color, (0, 1))[:, :3]
     return Field(seen.contiguous(), field.density, field.location)
 

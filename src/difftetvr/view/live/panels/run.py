@@ -39,7 +39,7 @@ class RunPanel:
                 least, most, step = (max(1, round(share * budget)) for share in (_LEAST_SHARE, _MOST_SHARE, _STEPS))
                 self._cells = gui.add_slider("Cells at most", min(least, budget), most, step, budget)
                 self._cells.on_update(self._ask)
-            self._training, self._held_out = (_Curve(desk, *look) for look in _CURVES)
+            self._training, self._held_out = (_Curve(desk, *look, progress.iterations) for look in _CURVES)
 
     @property
     def is_paused(self) -> bool:
@@ -94,14 +94,15 @@ class _Curve:
         desk: What it works with.
         label: What it shows.
         color: Of its line.
+        iterations: How far it may go.
     """
 
-    def __init__(self, desk: Desk, label: str, color: str) -> None:
+    def __init__(self, desk: Desk, label: str, color: str, iterations: int) -> None:
         self._points: list[tuple[float, float]] = []
         self._plot = desk.server.gui.add_uplot(
-            (np.arange(2.0), np.zeros(2)),  # bounds in x are kept in proportion to these
+            (np.zeros(1), np.zeros(1)),
             ({"label": "iteration"}, {"label": label, "stroke": color, "width": 1.5}),
-            scales={"x": {"time": False}},
+            scales={"x": {"time": False, "range": (0.0, float(iterations))}},  # viser loses bounds that follow data
             aspect=2.2,
             visible=False,
         )
