@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
@@ -164,12 +164,16 @@ class Render:
         from difftetvr.view.frames import FrameStyle
         from difftetvr.view.frames.axes import ROOM as ROOM_FOR_AXES
         from difftetvr.view.frames.color_bar import ROOM as ROOM_FOR_BAR
+        from difftetvr.view.frames.visible import glance, zoomed
 
         if self.paper.colorbar and subject.scale is None:
             raise CaptureError(f"{self.model} shows its own colours, not a scalar's; leave out --colorbar.")
         has_bar, has_axes = self.paper.colorbar, self.paper.axes
         room = (ROOM_FOR_BAR if has_bar else 0.0, ROOM_FOR_AXES if has_axes else 0.0)
         shots = place.shots(subject.bounds, room)
+        if shots.is_chosen and not has_axes:
+            (camera,) = shots.cameras
+            shots = replace(shots, cameras=[zoomed(camera, subject.seen_by(glance(camera)).alpha, room)])
         style = FrameStyle(
             None if self.paper.transparent else place.background(self.background),
             subject.scale if has_bar else None,

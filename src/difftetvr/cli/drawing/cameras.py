@@ -26,10 +26,7 @@ CAMERA_GROUPS = {
 }
 """Names of the options below."""
 
-# Where the default camera stands, seen from the mesh: in front, to the right, above.
-_DIRECTION = (0.55, -1.0, 0.55)
 _UP, _FOV, _SIZE, _FRAMES, _FPS = (0.0, 0.0, 1.0), 53.13, 512, 120, 24.0
-_FILLED = 0.94  # of the picture, by the box of what is shown
 _TURNS, _HALVINGS = 72, 50
 _MOST_FRAMES = 100_000
 
@@ -81,14 +78,14 @@ class CameraOptions:
     """File of the camera, .json, such as viewpoint writes it, instead of the following options; with --width its
     picture in that size."""
     eye: tuple[float, float, float] | None = None
-    """Position of the camera; default: where all of the mesh is seen; of what was fitted to photographs, that of the
-    photograph in the middle."""
+    """Position of the camera; default: where all of the mesh is seen, whose visible part then fills the picture; of
+    what was fitted to photographs, that of the photograph in the middle."""
     target: tuple[float, float, float] | None = None
-    """Point in the middle of the picture; default: the centre of the mesh."""
+    """Point in the middle of the picture; default: the centre of the mesh, or of what is seen of it."""
     up: tuple[float, float, float] | None = None
     """Direction that points upwards in the picture; default: 0 0 1."""
     fov: float | None = None
-    """Vertical field of view in degrees; default: 53.13."""
+    """Vertical field of view in degrees; default: 53.13, or so small that what is seen fills the picture."""
     capture: str | None = None
     """Capture whose cameras --view and --path are about, such as a folder of photographs; default: that of the run
     whose model this is."""
@@ -128,10 +125,17 @@ class CameraOptions:
 
 @dataclass(frozen=True)
 class Shots:
-    """Cameras of the pictures to take: one, or those of a film with its frames a second."""
+    """Cameras of the pictures to take: one, or those of a film with its frames a second.
+
+    Attributes:
+        cameras: The cameras.
+        fps: Frames a second; None for one picture.
+        is_chosen: Whether nothing says where the camera is, so that it may be turned to what there is to see.
+    """
 
     cameras: list[Camera]
     fps: float | None = None
+    is_chosen: bool = False
 
 
 class Place:
@@ -199,7 +203,7 @@ class Place:
             return Shots(cameras, film.fps or path.fps or _FPS)
         camera = self._start(bounds, room)
         if film.turntable is None:
-            return Shots([camera])
+            return Shots([camera], is_chosen=not (self.is_of_photographs or self._options.is_placed))
         from difftetvr.capture.camera_paths import turntable
 
         return Shots(turntable(camera, film.turntable, *self._axis(bounds)), film.fps or _FPS)
@@ -320,6 +324,7 @@ class Place:
 
         from difftetvr.rendering.cameras.pinhole import Camera
         from difftetvr.view.blank import require_drawable
+        from difftetvr.view.frames.visible import DIRECTION, FILLED
 
         options = self._options
         size = float((bounds[1] - bounds[0]).max())
@@ -329,11 +334,11 @@ class Place:
         target = torch.tensor(options.target, dtype=torch.float64) if options.target else bounds.mean(0)
         if options.eye is not None:
             return Camera.look_at(options.eye, target, up, fov_y, width, height)
-        direction = torch.tensor(_DIRECTION, dtype=torch.float64)
+        direction = torch.tensor(DIRECTION, dtype=torch.float64)
         direction = direction / direction.norm()
         # One far away has the axes of all that look this way.
         far = Camera.look_at(target + 10.0 * size * direction, target, up, fov_y, width, height)
-        free = ((1.0 - room[0]) * (_FILLED - 2.0 * room[1]), _FILLED - 2.0 * room[1])
+        free = ((1.0 - room[0]) * (FILLED - 2.0 * room[1]), FILLED - 2.0 * room[1])
         distance, (x, y) = _fitted(far, self._corners(bounds - target, up), free)
         camera = Camera.look_at(target + distance * direction, target, up, fov_y, width, height)
         if options.target is not None:

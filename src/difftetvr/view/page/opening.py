@@ -10,8 +10,9 @@ import torch
 
 from difftetvr.rendering import Camera
 from difftetvr.view.blank import require_drawable
+from difftetvr.view.frames.visible import DIRECTION
 
-_DIRECTION, _UP, _FOV = (0.45, -1.0, 0.35), (0.0, 0.0, 1.0), 53.13
+_UP, _FOV = (0.0, 0.0, 1.0), 53.13
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ class Opening:
         require_drawable(size, "The mesh")
         if camera is not None:
             return _as_camera(center, size, camera)
-        direction = torch.tensor(_DIRECTION, dtype=torch.float64)
+        direction = torch.tensor(DIRECTION, dtype=torch.float64)
         distance = 0.5 * float((extent / size).norm()) / math.sin(0.5 * math.radians(_FOV))
         return Opening(_three(distance * direction / direction.norm()), (0.0, 0.0, 0.0), _UP, _FOV)
 
