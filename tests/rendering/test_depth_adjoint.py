@@ -1,12 +1,14 @@
 """Derivatives of what depends on the optical depth alone: found without light, they are those found with it."""
 
+import math
+
 import pytest
 import torch
 from torch import Tensor
 
 import difftetvr as dtv
 from difftetvr.mesh import Field, TetMesh
-from difftetvr.rendering import Camera, CellFeatures, ScalarField, render
+from difftetvr.rendering import Camera, CellFeatures, Rays, ScalarField, render
 
 CAMERA = Camera.look_at((1.4, -1.1, 0.8), (0.0, 0.0, 0.0), fov_y=0.8, width=20, height=14)
 KNOTS = torch.tensor([0.0, 0.3, 0.3, 0.7, 1.0], dtype=torch.float64)
@@ -57,6 +59,30 @@ def test_what_depends_on_the_optical_depth_needs_no_light(what: str, kind: str, 
         torch.testing.assert_close(
             torch.zeros(1) if one is None else one, torch.zeros(1) if other is None else other, rtol=1e-9, atol=1e-11
         )
+
+
+@pytest.mark.parametrize("renderer", ["marching", "linked-list"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("what", ["optical_depth", "alpha"])
+def test_rays_that_stop_at_a_face_stop_there_in_the_adjoint(what: str, dtype: torch.dtype, renderer: str) -> None:
+    """In a uniform medium, the threshold lies where many rays pass a face: rounding decides, and must decide alike."""
+    mesh = TetMesh.grid((4, 4, 4), (0.0, 0.0, 0.0), (4.0, 4.0, 4.0)).to(dtype=dtype)
+    density = torch.full((mesh.num_vertices,), 0.5, dtype=dtype, requires_grad=True)
+    origins = 3.8 * torch.rand(200, 3, generator=torch.Generator().manual_seed(2)) + 0.1
+    origins[:, 2] = -1.0
+    rays = Rays(origins.to(dtype), torch.tensor([0.0, 0.0, 1.0], dtype=dtype))
+    image = render(
+        mesh,
+        Field(density.new_zeros(len(density), 3), density),
+        rays,
+        transmittance_threshold=math.exp(-1.0),
+        renderer=renderer,
+    )
+    (found,) = torch.autograd.grad(getattr(image, what).sum(), density)
+    # Of the same density everywhere, both are known functions.
+    depth = image.optical_depth.detach()
+    by_depth = torch.ones_like(depth) if what == "optical_depth" else torch.exp(-depth)
+    torch.testing.assert_close(found.sum(), (by_depth * depth / 0.5).sum(), rtol=1e-4, atol=0.0)
 
 
 @pytest.mark.parametrize("wanted", ["color", "optical_depth"])

@@ -126,3 +126,20 @@ def test_mistakes_get_one_sentence(arguments: tuple[Any, ...], message: str) -> 
     with pytest.raises(MeshError, match=message) as error:
         isosurface(TetMesh.grid((2, 2, 2)), *arguments)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("level", [torch.tensor([[0.5]], dtype=torch.float64), torch.tensor([0.5]), 0.5])
+def test_levels_are_one_number_and_leave_the_precision(level) -> None:
+    mesh = TetMesh.grid((2, 2, 2))
+    places, triangles = isosurface(mesh, mesh.vertices[:, 0] + 0.1, level)
+    assert places.dtype == torch.float32 and len(triangles)
+    assert torch.equal(places, isosurface(mesh, mesh.vertices[:, 0] + 0.1, 0.5)[0])
+
+
+@pytest.mark.parametrize(
+    "level", [torch.tensor(0.5 + 0j), torch.tensor([0.1, 0.2]), torch.tensor(float("nan")), "high"]
+)
+def test_other_levels_are_refused(level) -> None:
+    mesh = TetMesh.grid((2, 2, 2))
+    with pytest.raises(MeshError, match="level is"):
+        isosurface(mesh, mesh.vertices[:, 0], level)

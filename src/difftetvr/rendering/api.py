@@ -121,7 +121,9 @@ def render(
         field: Channels and density per vertex (linear inside each cell) or per cell (constant); or scalars likewise,
             with a transfer function; or channels per cell over the density of either (`CellFeatures`).
         camera: A camera, inside or outside of the mesh; any bundle of rays; or cameras, which are rendered together. A
-            field with harmonics is rendered once for each point where rays start, or direction if those are fewer.
+            field with harmonics is rendered once for each point where rays start, or direction if those are fewer;
+            what its colours depend on that point by is then shared by all rays that start there, so that derivatives
+            are those by a camera's place, and not by the origins of single rays.
         background: (C,) channels behind the volume, linear RGB for colours; 0 if None.
         renderer: How crossings are found and ordered. ``"marching"`` walks from cell to cell; ``"linked-list"`` sorts
             the crossings of each pixel; ``"projected"`` sorts the cells once for the whole view of a pinhole camera,
@@ -229,7 +231,7 @@ def _render(
     behind = as_background(background, mesh.vertices, view.task.channels)
     limits = view.limits(clip_plane)
     if 0 in view.shape:
-        empty = mesh.vertices.new_zeros(view.shape)
+        empty = view.empty(view.shape)
         return RenderedImage(empty[..., None].expand(*view.shape, view.task.channels), empty, empty, empty)
     with view.task.backend.exclusive():
         shot = view.shot(limits)

@@ -64,7 +64,8 @@ class RenderFunction(torch.autograd.Function):
         wanted = Wanted(needs_vertices or needs_pose, needs_limits, needs_lines, needs_knots)
         derivatives = [None if part is None or not part.numel() else backend.floats(part) for part in by_image]
         with with_flags(ctx.flags), backend.exclusive(task.deterministic):
-            image = ImageAdjoint(Pixels(*derivatives), ctx.how, *ctx.gathered)
+            light, distance = ctx.gathered
+            image = ImageAdjoint(Pixels(*derivatives), ctx.how, light, distance, task.threshold == 0.0)
             gradients = render_adjoint(shot.tracer, image, task.mesh.num_vertices, wanted, task.deterministic)
             geometry, parts = gradient_tensors(task, gradients, pose, vertices)
         by_background = None

@@ -79,6 +79,12 @@ class PreparedView:
         shift = None if self.bundle is None else self.task.backend.floats(self.bundle.shift)
         return Shot(self.tracer(limits), self.rays.count, shift, self.unit)
 
+    def empty(self, shape: tuple[int, ...]) -> torch.Tensor:
+        """What there is to see of no rays, in the precision of the mesh; autograd knows what it is no part of."""
+        tensors = (self.vertices, *self.parts, *(() if self.lines is None else (self.lines,)))
+        nothing = sum((tensor.reshape(-1)[:0].sum() for tensor in tensors), self.vertices.new_zeros(()))
+        return nothing.to(self.task.mesh.vertices.dtype).expand(shape)
+
     @property
     def lines(self) -> torch.Tensor | None:
         """(N, 6) origins and unit directions of the rays, in that unit; None where they are a camera's."""

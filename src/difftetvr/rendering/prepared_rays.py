@@ -10,7 +10,7 @@ import torch
 
 from difftetvr.mesh import TetMesh
 from difftetvr.rendering.clip_plane import clip_rays
-from difftetvr.rendering.rays import Rays
+from difftetvr.rendering.rays import Rays, unit_vectors
 
 KNOW_FLOAT64 = ("cpu", "cuda")
 """Devices that compute in float64."""
@@ -48,7 +48,7 @@ class PreparedRays:
         eye = rays.eye
         origins = (rays.origins.reshape(-1, 3) if eye is None else eye).to(device, dtype).expand_as(directions)
         near, far = (end.reshape(-1).to(device, dtype) for end in rays.ends)
-        directions = torch.nn.functional.normalize(directions, dim=1, eps=0.0)
+        directions = unit_vectors(directions)
         low, high = torch.aminmax(mesh.vertices.detach().to(dtype), dim=0)
         center, radius = 0.5 * (low + high), 0.5 * (high - low).square().sum().sqrt()
         shift = ((center - origins.detach()) * directions.detach()).sum(1)

@@ -68,7 +68,8 @@ class Rays:
     def _require_sound(self) -> None:
         o, d, near, far = (tensor.detach() for tensor in (self.origins, self.directions, self.ends[0], self.ends[1]))
         length = d.abs().amax(-1)
-        bad = ~(torch.isfinite(o).all(-1) & torch.isfinite(length) & (length > 0) & (near <= far))
+        ordered = (near <= far) & (near < math.inf) & (far > -math.inf)
+        bad = ~(torch.isfinite(o).all(-1) & torch.isfinite(length) & (length > 0) & ordered)
         if not bool(bad.any()):
             return
         place = tuple(torch.nonzero(bad)[0].tolist())
@@ -80,7 +81,8 @@ class Rays:
                 f"{where} has the direction {shown(d[place].tolist())}; directions must be finite and not 0."
             )
         raise CameraError(
-            f"{where} is looked at from {float(near[place])} to {float(far[place])}; near must not be beyond far."
+            f"{where} is looked at from {float(near[place])} to {float(far[place])}; near must not be beyond far, nor "
+            "both of them infinitely far away on one side."
         )
 
     @property
@@ -142,9 +144,17 @@ class Rays:
 
         Args:
             distances: (...) or a number, in world units.
+
+        Raises:
+            CameraError: There are not so many.
         """
         along = as_reals(distances, "The distances", CameraError, self.directions.dtype).to(self.directions)
-        return self.origins + along[..., None] * torch.nn.functional.normalize(self.directions, dim=-1)
+        try:
+            return self.origins + along[..., None] * unit_vectors(self.directions)
+        except RuntimeError as reason:
+            raise CameraError(
+                f"The distances have shape {tuple(along.shape)}, the rays {tuple(self.shape)}; pass one each, or one."
+            ) from reason
 
     def relative_to(self, origin: Sequence[float]) -> Rays:
         """The same rays in a world whose origin lies at a point of this one, (3,); in float64 unless it is the same."""
@@ -155,7 +165,17 @@ class Rays:
 
     @staticmethod
     def stacked(bundles: Sequence[Rays]) -> Rays:
-        """Several bundles of one shape as one, (B, ...)."""
+        """Several bundles of one shape as one, (B, ...).
+
+        Raises:
+            CameraError: They have several shapes, or there is none.
+        """
+        shapes = sorted({tuple(bundle.shape) for bundle in bundles})
+        if len(shapes) != 1:
+            told = "there is none" if not shapes else f"these have the shapes {shapes[0]} and {shapes[1]}"
+            raise CameraError(
+                f"Bundles of rays are stacked if they have one shape, but {told}; join them, or pass some."
+            )
         vectors = [(bundle.origins, bundle.directions, *bundle.ends) for bundle in bundles]
         return Rays(*(torch.stack(part) for part in zip(*vectors, strict=True)))
 
@@ -166,6 +186,15 @@ class Rays:
             (b.origins.reshape(-1, 3), b.directions.reshape(-1, 3), *(e.reshape(-1) for e in b.ends)) for b in bundles
         ]
         return Rays(*(torch.cat(part) for part in zip(*parts, strict=True)))
+
+
+def unit_vectors(vectors: torch.Tensor) -> torch.Tensor:
+    """(..., 3) vectors of length 1, of such of any length but 0, whose squares need not be numbers."""
+    exponent = vectors.detach().abs().amax(-1, keepdim=True).log2().floor()
+    most = 1000 if vectors.dtype == torch.float64 else 120
+    # A power of two: vectors of common lengths come to the very bits they would come to without.
+    scale = torch.ldexp(torch.ones_like(vectors[..., :1]), -exponent.clamp(-most, most))
+    return torch.nn.functional.normalize(vectors * scale, dim=-1, eps=0.0)
 
 
 @runtime_checkable

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 
-from difftetvr.errors import MeshError
-from difftetvr.inputs import as_number
+from difftetvr.errors import MeshError, shown
+from difftetvr.inputs import as_reals
 from difftetvr.mesh import TetMesh
 from difftetvr.mesh.topology.incidence import cell_edges
 from difftetvr.mesh.topology.topology import LOCAL_EDGE_OF
@@ -70,10 +70,11 @@ def crossed_edges(mesh: TetMesh, scalar: torch.Tensor, level: float | torch.Tens
     values = table[:, 0]
     if not bool(torch.isfinite(values.detach()).all()):
         raise MeshError("A scalar is not finite; give finite values, or remove the cells around them.")
-    height: Any = level if isinstance(level, torch.Tensor) else as_number(level, "level", MeshError)
-    if not math.isfinite(as_number(height, "level", MeshError)):
-        raise MeshError(f"level is {as_number(height, 'level', MeshError)}; give a finite number.")
-    above = values.detach() >= (height.detach().to(values) if isinstance(height, torch.Tensor) else height)
+    height = as_reals(level, "level", MeshError, values.dtype, "give a finite number")
+    if height.numel() != 1 or not math.isfinite(float(height.detach())):
+        raise MeshError(f"level is {shown(level)}; give a finite number.")
+    height = height.reshape(())  # so that it takes the precision of the values
+    above = values.detach() >= height.detach().to(values)
     edges = mesh.topology.edges.long()
     is_cut = above[edges[:, 0]] != above[edges[:, 1]]
     number = torch.cumsum(is_cut, 0) - 1

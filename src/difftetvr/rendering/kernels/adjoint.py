@@ -28,12 +28,14 @@ class ImageAdjoint:
         how: How the image was composed.
         light: (N, width) records of channels and optical depth.
         distance: (N,) integral of distance.
+        is_complete: Whether rays went on to their ends, however little light was left.
     """
 
     image: Pixels
     how: Composition
     light: Any
     distance: Any
+    is_complete: bool
 
 
 @dataclass
@@ -62,8 +64,9 @@ def render_adjoint(
         in_order: Whether sums over rays have a certain order, see :mod:`difftetvr.rendering.kernels.shares`.
     """
     by = image.image
+    # Where rays stopped early, only the same products of transmittances tell exactly where.
     sees_light = by.depth is not None or (by.color is not None and tracer.view.channels > 0)
-    kernel = _LightAdjoint if sees_light else _DepthAdjoint
+    kernel = _LightAdjoint if sees_light or not image.is_complete else _DepthAdjoint
     return gradients_by(kernel, tracer, image, Asked(vertex_count, wanted, in_order))
 
 
@@ -78,11 +81,9 @@ class _DepthAdjoint(WalkAdjoint):
         by_pixel = pixel_adjoint(image.image, image.how, view.channels, gathered, pixel, valid)
         super().__init__(tracer, rays, gradients, by_pixel.color)
         self.half = 0.5 * by_pixel.optical_depth
-        # Where the walk before stopped.
-        self.last = dr.select(view.threshold > 0, -dr.log(view.threshold), dr.inf)
 
-    def begin(self) -> Any:
-        return dr.zeros(self.view.backend.Float, dr.width(self.rays.pixel))
+    def begin(self) -> None:
+        return None
 
     def cross(
         self, start: list[Any], end: list[Any], progress: Any, is_crossed: Any
@@ -91,11 +92,10 @@ class _DepthAdjoint(WalkAdjoint):
         length, none = dr.fmax(t1 - t0, 0.0), dr.zeros_like(t0)
         d_density = self.half * length
         d_length = dr.select(is_crossed, self.half * (s0 + s1), 0.0)
-        progress = dr.fma(0.5 * length, s0 + s1, progress)
-        return progress, [-d_length, d_density, none], [d_length, d_density, none]
+        return None, [-d_length, d_density, none], [d_length, d_density, none]
 
     def goes_on(self, ray: AdjointRay) -> Any:
-        return (ray.progress < self.last) & (self.half != 0)
+        return self.half != 0
 
     def _radiance(self, channels: list[Any]) -> Any:
         return self.view.backend.Float(0)

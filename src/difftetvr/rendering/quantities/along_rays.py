@@ -144,7 +144,7 @@ def _looked(
     view = prepare_view(mesh, medium_of(mesh, field), camera, options)
     shape = view.shape if values.dim() == 0 else (*view.shape, values.shape[-1])
     if 0 in shape:
-        return mesh.vertices.new_zeros(shape)
+        return view.empty(shape)
     return look(view).to(mesh.vertices.dtype).reshape(shape)
 
 

@@ -8,7 +8,9 @@ from typing import Any
 import torch
 from torch.autograd.function import once_differentiable
 
+from difftetvr.memory import tried_twice
 from difftetvr.rendering.autograd import gradient_tensors
+from difftetvr.rendering.flags import flags_here, with_flags
 from difftetvr.rendering.kernels.gradients import Wanted
 from difftetvr.rendering.kernels.profile import Table, Weighed, ask_depths, ask_distances, depths_adjoint
 from difftetvr.rendering.preparation import PreparedView
@@ -72,12 +74,14 @@ class _ProfileFunction(torch.autograd.Function):
             found = ask(tracer, _table(backend, questions), math.prod(questions.shape))
             answers, density = (backend.tensor(part, *questions.shape) for part in (found.values, found.density))
         ctx.task, ctx.tracer, ctx.is_inverse = task, tracer, is_inverse
+        ctx.flags = flags_here()
         needs_pose = ctx.needs_input_grad[4]
         ctx.save_for_backward(answers if is_inverse else questions, density, pose, vertices if needs_pose else None)
         return answers
 
     @staticmethod
     @once_differentiable
+    @tried_twice
     def backward(ctx: Any, g_answers: Any) -> Any:
         """Walk once more with the derivatives by the optical depths."""
         task, backend = ctx.task, ctx.task.backend
@@ -93,7 +97,7 @@ class _ProfileFunction(torch.autograd.Function):
         if not (wanted.vertices or wanted.limits or wanted.lines or any(needs_parts)):
             return *(None for _ in range(7)), questions, *(None for _ in needs_parts)
         ahead = weights.flip(1).cumsum(1).flip(1)
-        with backend.exclusive(task.deterministic):
+        with with_flags(ctx.flags), backend.exclusive(task.deterministic):
             depths = Weighed(*(_table(backend, values) for values in (distances, weights, ahead)))
             gradients = depths_adjoint(ctx.tracer, depths, task.mesh.num_vertices, wanted, task.deterministic)
             geometry, parts = gradient_tensors(task, gradients, pose, vertices)

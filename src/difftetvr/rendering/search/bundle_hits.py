@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
+import numpy as np
 
 from difftetvr.backend import Backend
 from difftetvr.recording import replayed
@@ -164,6 +165,8 @@ def _starts_at_one_point(scene: Scene, lane: Any, mesh: OrderedMesh, limits: Any
     reach = replayed(reach_of_beginnings, scene, lane, limits)
     assert mesh.largest is not None
     ends = reach.numpy()[:6].astype(float)
+    if not np.isfinite(ends).all():
+        return None
     spread, size = (ends[0::2] + ends[1::2]).max(), max(abs(ends).max(), mesh.largest)
     if not spread <= _ONE_POINT * float(dr.epsilon(scene.backend.Float)) * size:
         return None
