@@ -77,7 +77,7 @@ def test_render_frames_the_mesh(run, tmp_path, capsys):
     pixels = np.asarray(Image.open(picture))
     assert pixels.shape == (30, 40, 3)
     assert pixels[10:20, 15:25].max() > 20
-    assert pixels[0].max() == pixels[-1].max() == 0, "the mesh lies within the picture"
+    assert max(pixels[0].max(), pixels[-1].max()) <= 5, "what is seen lies within the picture, but for haze"
     given = ["--eye", "0", "-3", "0.5", "--target", "0", "0", "50", "--background", "0", "1", "0"]
     assert cli.main(["render", model, "-o", str(picture), "--width", "8", "--height", "8", *given]) == 0
     assert np.asarray(Image.open(picture)).reshape(-1, 3).tolist() == [[0, 255, 0]] * 64

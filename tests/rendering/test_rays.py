@@ -15,7 +15,7 @@ from torch import Tensor
 import difftetvr as dtv
 from difftetvr.errors import CameraError, DiffTetError
 from difftetvr.mesh import Field, TetMesh
-from difftetvr.rendering import Camera, Rays, RenderedImage, ScalarField, render, transmittance_at
+from difftetvr.rendering import Camera, Rays, RenderedImage, ScalarField, render
 
 TRACERS = ("marching", "linked-list")
 
@@ -345,43 +345,6 @@ def test_shapes_are_kept(shape: tuple[int, ...]) -> None:
     assert image.alpha.shape == image.depth.shape == image.optical_depth.shape == shape
     single = render(mesh, field, Rays(origins[:count], directions[:count]))
     assert float((flat(image) - flat(single)).abs().sum()) < 1e-9
-
-
-@pytest.mark.parametrize("renderer", ["marching", "linked-list"])
-def test_no_rays_have_derivatives_of_zero(renderer: str) -> None:
-    mesh, field = scene(channels=2)
-    leaves = [part.detach().clone().requires_grad_() for part in (mesh.vertices, field.color, field.density)]
-    origins = torch.zeros(0, 3).requires_grad_()
-    rays = Rays(origins, torch.zeros(0, 3))
-    mesh, field = mesh.with_vertices(leaves[0]), type(field)(leaves[1], leaves[2])
-    image = render(mesh, field, rays, renderer=renderer)
-    (image.color.sum() + image.depth.sum() + transmittance_at(mesh, field, rays, 1.0).sum()).backward()
-    assert all(leaf.grad is not None and not leaf.grad.any() for leaf in leaves)
-    assert origins.grad is not None and origins.grad.shape == (0, 3)
-
-
-@pytest.mark.parametrize("length", [1e-300, 1e-200, 1e-30, 1e30, 1e200, 1e300])
-def test_directions_of_any_length_mean_the_same(length: float) -> None:
-    mesh, field = scene()
-    origins, directions = random_rays(20)
-    directions = directions.double() / directions.double().abs().amax(-1, keepdim=True)
-    expected, found = (render(mesh, field, Rays(origins.double(), scale * directions)) for scale in (1.0, length))
-    assert float(expected.alpha.max()) > 0.1
-    torch.testing.assert_close(found.alpha, expected.alpha)
-    at, expected_at = (Rays(origins.double(), scale * directions).at(2.0) for scale in (length, 1.0))
-    torch.testing.assert_close(at, expected_at)
-
-
-@pytest.mark.filterwarnings("error")
-def test_rays_from_infinitely_far_away_end_where_they_are_told_to() -> None:
-    mesh, field = scene()
-    origins, directions = random_rays(30)
-    half = Rays(origins, directions, -math.inf, 2.0)
-    image, far = render(mesh, field, half), render(mesh, field, Rays(origins, directions, -50.0, 2.0))
-    torch.testing.assert_close(image.alpha, far.alpha)
-    for ends in ((math.inf, math.inf), (-math.inf, -math.inf)):
-        with pytest.raises(CameraError, match="infinitely far away on one side"):
-            Rays(origins, directions, *ends)
 
 
 def test_one_origin_serves_all_directions() -> None:

@@ -12,7 +12,7 @@ DIRECTION = (0.55, -1.0, 0.55)
 FILLED = 0.94
 """Part of the picture that is filled, as far as nothing else has to be there."""
 
-_FAINT = 0.02  # opacity up to which nothing is seen
+_FAINT = 0.02  # opacity up to which haze is let go beyond the picture
 _LOOK = 128  # pixels of the longer side of a picture that tells what can be seen
 _MOST = 4.0  # a lens may be as many times as long, for what fills next to nothing
 
