@@ -26,7 +26,7 @@ CAMERA_GROUPS = {
 }
 """Names of the options below."""
 
-_UP, _FOV, _SIZE, _FRAMES, _FPS = (0.0, 0.0, 1.0), 53.13, 512, 120, 24.0
+_SIZE, _FRAMES, _FPS = 512, 120, 24.0
 _TURNS, _HALVINGS = 72, 50
 _MOST_FRAMES = 100_000
 
@@ -242,12 +242,14 @@ class Place:
 
     def _axis(self, bounds: torch.Tensor) -> tuple[list[float], list[float]]:
         """A point of the axis of a turntable, and its direction."""
+        from difftetvr.view.frames.visible import UP
+
         options, views = self._options, None
         if self.is_of_photographs and options.target is None:
             views = self._known_views()
         if views is not None:
             return views.focus.tolist(), list(options.up or views.up.tolist())
-        return list(options.target or bounds.mean(0).tolist()), list(options.up or _UP)
+        return list(options.target or bounds.mean(0).tolist()), list(options.up or UP)
 
     def _looks_at_photographs(self) -> bool:
         """Whether the cameras of the capture say where the scene is looked at from."""
@@ -324,13 +326,13 @@ class Place:
 
         from difftetvr.rendering.cameras.pinhole import Camera
         from difftetvr.view.blank import require_drawable
-        from difftetvr.view.frames.visible import DIRECTION, FILLED
+        from difftetvr.view.frames.visible import DIRECTION, FILLED, FOV, UP
 
         options = self._options
         size = float((bounds[1] - bounds[0]).max())
         require_drawable(size, str(self._model))
         width, height = (_SIZE if pixels is None else pixels for pixels in (options.width, options.height))
-        up, fov_y = options.up or _UP, math.radians(_FOV if options.fov is None else options.fov)
+        up, fov_y = options.up or UP, math.radians(FOV if options.fov is None else options.fov)
         target = torch.tensor(options.target, dtype=torch.float64) if options.target else bounds.mean(0)
         if options.eye is not None:
             return Camera.look_at(options.eye, target, up, fov_y, width, height)

@@ -106,9 +106,9 @@ class View:
 
     def _mesh_scene(self, device: torch.device, console: Console) -> Scene:
         from difftetvr.cli.drawing.subjects import renderer_for
+        from difftetvr.cli.live.scenes import scene_around
         from difftetvr.rendering import ScalarField
         from difftetvr.view.live.contents import MeshContent
-        from difftetvr.view.live.scene import Scene
         from difftetvr.view.live.settings import ScalarLook, Settings
 
         if given := self.volume.given():
@@ -124,22 +124,12 @@ class View:
         if isinstance(shown.field, ScalarField):
             look = ScalarLook(shown.field.transfer_function, shown.field.limits, shown.density)
         views = self._views_of(place, console)
-        known, photographs = place.views, None if views is None else views.capture
-        (camera,) = place.shots(content.bounds).cameras
-        return Scene(
-            title=self.model.name,
-            content=content,
-            bounds=content.bounds if known is None or photographs is None else photographs.bounds.double(),
-            start=camera,
-            up=tuple(known.up.tolist()) if known is not None else (0.0, 0.0, 1.0),
-            settings=Settings(background=place.background(self.background), look=look),
-            views=views,
-            scalar=shown.name,
-        )
+        settings = Settings(background=place.background(self.background), look=look)
+        return scene_around(self.model.name, content, place, views, settings, shown.name)
 
     def _volume_scene(self, device: torch.device, console: Console) -> Scene:
+        from difftetvr.cli.live.scenes import scene_around
         from difftetvr.view.live.contents import VolumeContent
-        from difftetvr.view.live.scene import Scene
         from difftetvr.view.live.settings import ScalarLook, Settings
 
         for name, value in (("scalar", self.scalars.scalar), ("capture", self.capture), ("format", self.format)):
@@ -151,9 +141,8 @@ class View:
         look = ScalarLook(shown.function, shown.scale.value_range, shown.density)
         content = VolumeContent(volume, look, device)
         place = Place(self.model, CameraOptions(camera=self.camera), console)
-        (camera,) = place.shots(content.bounds).cameras
         settings = Settings(background=place.background(self.background), look=look)
-        return Scene(self.model.name, content, content.bounds, camera, (0.0, 0.0, 1.0), settings, scalar="value")
+        return scene_around(self.model.name, content, place, None, settings, "value")
 
     def _capture_scene(self, console: Console) -> Scene:
         import torch

@@ -105,22 +105,13 @@ def _scene_of(progress: Progress, folder: RunFolder, console: Console, capture: 
     """What there is to see of a run, looked at as its model will be."""
     from difftetvr.capture import CameraSet
     from difftetvr.cli.drawing.cameras import CameraOptions, Place
+    from difftetvr.cli.live.scenes import scene_around
     from difftetvr.view.live.contents import MeshContent
-    from difftetvr.view.live.scene import Scene, Views
+    from difftetvr.view.live.scene import Views
     from difftetvr.view.live.settings import Settings
 
     place = Place(folder.model, CameraOptions(), console)
     if capture is not None and place.is_of_photographs:
         place.take(CameraSet(capture.cameras, capture.test, capture.name))
-    content = MeshContent(progress.mesh, progress.field)
-    (camera,) = place.shots(content.bounds).cameras
-    known = place.views
-    return Scene(
-        title=str(folder.path),
-        content=content,
-        bounds=content.bounds if known is None or capture is None else capture.bounds.double(),
-        start=camera,
-        up=(0.0, 0.0, 1.0) if known is None else tuple(known.up.tolist()),
-        settings=Settings(background=place.background(None)),
-        views=None if capture is None else Views.of(capture),
-    )
+    content, views = MeshContent(progress.mesh, progress.field), None if capture is None else Views.of(capture)
+    return scene_around(str(folder.path), content, place, views, Settings(background=place.background(None)))

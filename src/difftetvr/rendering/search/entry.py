@@ -55,14 +55,12 @@ class EntryCounts:
         half_faces: (N,) one of them, which is all where no ray has more.
         most: (1,) the greatest number.
         total: (1,) the sum of the numbers.
-        ends: (2,) both, for a host that waits for nothing else.
     """
 
     count: Any
     half_faces: Any
     most: Any
     total: Any
-    ends: Any
 
 
 def count_entries(search: EntrySearch, rays: int) -> EntryCounts:
@@ -77,10 +75,8 @@ def count_entries(search: EntrySearch, rays: int) -> EntryCounts:
     search.for_each(visit, lambda: dr.eval(count, half_faces))
     # Of no rays there is no maximum.
     most, total = (dr.max(count), dr.sum(count)) if rays else (dr.zeros(uint, 1), dr.zeros(uint, 1))
-    ends = dr.empty(uint, 2)
-    dr.scatter(ends, search.scene.backend.UInt2(most, total), uint(0))
-    dr.eval(most, total, ends)
-    return EntryCounts(count, half_faces, most, total, ends)
+    dr.eval(most, total)
+    return EntryCounts(count, half_faces, most, total)
 
 
 def list_entries(search: EntrySearch, counts: EntryCounts, most: int, total: int, has_starts: bool) -> EntryLists:
@@ -102,9 +98,18 @@ def list_entries(search: EntrySearch, counts: EntryCounts, most: int, total: int
 
 def find_entries(search: EntrySearch, has_starts: bool) -> EntryLists:
     """Count and list the entries of every ray."""
-    counts = replayed(count_entries, search, search.scene.rays.count)
-    most, total = counts.ends.numpy().tolist()
+    counts, ends = replayed(_counts_and_ends, search, search.scene.rays.count)
+    most, total = ends.numpy().tolist()
     return list_entries(search, counts, most, total, has_starts)
+
+
+def _counts_and_ends(search: EntrySearch, rays: int) -> tuple[EntryCounts, Any]:
+    """The counts, and (2,) the greatest number and the sum of all, for a host that waits for nothing else."""
+    counts, backend = count_entries(search, rays), search.scene.backend
+    ends = dr.empty(backend.UInt, 2)
+    dr.scatter(ends, backend.UInt2(counts.most, counts.total), backend.UInt(0))
+    dr.eval(ends)
+    return counts, ends
 
 
 def _fill(search: EntrySearch, count: Any, total: int, rays: int) -> tuple[Any, Any]:

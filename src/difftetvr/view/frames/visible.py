@@ -9,6 +9,9 @@ from difftetvr.rendering import Camera
 DIRECTION = (0.55, -1.0, 0.55)
 """Where it stands, seen from the middle: in front, to the right, above."""
 
+UP, FOV = (0.0, 0.0, 1.0), 53.13
+"""What is upwards in its pictures, and the degrees that it sees."""
+
 FILLED = 0.94
 """Part of the picture that is filled, as far as nothing else has to be there."""
 

@@ -151,9 +151,7 @@ def _photograph(scene: Scene, camera: Camera) -> torch.Tensor:
 
 def _seen_in(capture: Capture, view: int, camera: Camera, depth: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """(H, W, 3) what a photograph shows of points at (H, W) depths before a camera, and (H, W) whether it does."""
-    rays = camera.rays()
-    origins, directions = (part.detach().double().cpu() for part in (rays.origins, rays.directions))
-    points = origins + depth[..., None] * torch.nn.functional.normalize(directions, dim=-1)
+    points = camera.rays().to("cpu", torch.float64).at(depth).detach()
     places, enlarged = capture.cameras[view].project(points.reshape(-1, 3))
     photograph = capture.images[view].float()
     height, width = photograph.shape[:2]

@@ -10,9 +10,7 @@ import torch
 
 from difftetvr.rendering import Camera
 from difftetvr.view.blank import require_drawable
-from difftetvr.view.frames.visible import DIRECTION
-
-_UP, _FOV = (0.0, 0.0, 1.0), 53.13
+from difftetvr.view.frames.visible import DIRECTION, FOV, UP
 
 
 @dataclass(frozen=True)
@@ -48,8 +46,8 @@ class Opening:
         if camera is not None:
             return _as_camera(center, size, camera)
         direction = torch.tensor(DIRECTION, dtype=torch.float64)
-        distance = 0.5 * float((extent / size).norm()) / math.sin(0.5 * math.radians(_FOV))
-        return Opening(_three(distance * direction / direction.norm()), (0.0, 0.0, 0.0), _UP, _FOV)
+        distance = 0.5 * float((extent / size).norm()) / math.sin(0.5 * math.radians(FOV))
+        return Opening(_three(distance * direction / direction.norm()), (0.0, 0.0, 0.0), UP, FOV)
 
     def camera(self, center: torch.Tensor, size: float, pixels: int) -> Camera:
         """The camera of a square picture, in the world.
