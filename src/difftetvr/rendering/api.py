@@ -227,15 +227,15 @@ def _render(
     options: ViewOptions,
     clip_plane: Sequence[float] | torch.Tensor | None,
 ) -> RenderedImage:
-    view = prepare_view(mesh, field, camera, options)
+    view = prepare_view(mesh, field, camera, options, clip_plane)
     behind = as_background(background, mesh.vertices, view.task.channels)
-    limits = view.limits(clip_plane)
     if 0 in view.shape:
         empty = view.empty(view.shape)
         return RenderedImage(empty[..., None].expand(*view.shape, view.task.channels), empty, empty, empty)
     with view.task.backend.exclusive():
-        shot = view.shot(limits)
-    pixels = RenderFunction.apply(view.task, shot, view.vertices, view.pose, behind, limits, view.lines, *view.parts)
+        shot = view.shot()
+    tensors = view.vertices, view.pose, behind, view.limits, view.lines, *view.parts
+    pixels = RenderFunction.apply(view.task, shot, *tensors)
     if view.task.backend.dtype != mesh.vertices.dtype:
         pixels = tuple(part.to(mesh.vertices.dtype) for part in pixels)
     return RenderedImage(*pixels).reshaped(*view.shape)

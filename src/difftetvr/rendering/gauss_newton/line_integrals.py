@@ -55,7 +55,7 @@ def model_line_integrals(
         if tuple(tensor.shape) != tuple(shape):
             raise DiffTetError(f"A derivative or step has shape {tuple(tensor.shape)}; this view takes {tuple(shape)}.")
     backend = view.task.backend
-    tracer = view.tracer(view.limits(None))
+    tracer = view.tracer(view.limits)
     with backend.exclusive(deterministic):
         slopes, curvatures, steps = (
             backend.floats(part.reshape(-1)) for part in (*errors, face_steps.to(mesh.vertices) * view.unit)

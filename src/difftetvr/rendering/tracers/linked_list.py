@@ -14,11 +14,22 @@ from typing import Any
 import drjit as dr
 
 from difftetvr.backend import Backend
+from difftetvr.mesh import TetMesh
+from difftetvr.recording import few_lengths
+from difftetvr.rendering.search.bundle_hits import Stretches
+from difftetvr.rendering.search.memory_order import MemoryOrder
+from difftetvr.rendering.search.plan import Search, SearchPlan
 from difftetvr.rendering.search.scene import NONE
 from difftetvr.rendering.tracers.aim import Aim
 from difftetvr.rendering.tracers.bands import Band, bands_of
-from difftetvr.rendering.tracers.fragments import FragmentLists, FragmentRaster
-from difftetvr.rendering.traversal.crossing import Kernel, View, cross_cell, lanes_of
+from difftetvr.rendering.tracers.fragments import (
+    BundleFragments,
+    CameraFragments,
+    FragmentBand,
+    FragmentLists,
+    Fragments,
+)
+from difftetvr.rendering.traversal.crossing import Kernel, View, cross_cell
 from difftetvr.rendering.traversal.rays import Lanes
 
 FRAGMENT_BUDGET = 1 << 26
@@ -34,29 +45,31 @@ class LinkedList:
 
     Attributes:
         view: What kernels read.
-        raster: Finds fragments.
+        search: Finds fragments.
         bands: Parts of the image whose lists fit the budget.
         local_size: Fragments that a ray sorts at a time.
+        starts_inside: Whether some crossings begin behind the camera.
     """
 
     view: View
-    raster: FragmentRaster
-    bands: list[Band]
+    search: Search
+    bands: list[FragmentBand]
     local_size: int
+    starts_inside: bool
+
+    @staticmethod
+    def plan(backend: Backend, mesh: TetMesh, rays: Any, stretches: Stretches | None) -> SearchPlan:
+        """How to find the fragments of rays: those of a camera, or stretches of a bundle."""
+        if stretches is None:
+            return CameraFragments.of(backend, MemoryOrder.of(mesh).tables(backend), rays)
+        return BundleFragments.of(backend, mesh, stretches)
 
     @staticmethod
     def of(aim: Aim) -> LinkedList:
-        """Count the fragments of every ray."""
-        view, raster = aim.view, FragmentRaster(aim)
-        counts = raster.count()
-        longest = int(counts.max())
-        size = next((size for size in LOCAL_SIZES if size >= longest), LOCAL_SIZES[-1])
-        return LinkedList(view, raster, bands_of(counts, FRAGMENT_BUDGET), size)
-
-    @property
-    def starts_inside(self) -> bool:
-        """Whether some crossings begin behind the camera."""
-        return self.raster.starts_inside
+        """Take the fragments of every ray."""
+        found: Fragments = aim.found
+        size = next((size for size in LOCAL_SIZES if size >= found.longest), LOCAL_SIZES[-1])
+        return LinkedList(aim.view, found.search, _bands(aim.view, found), size, found.starts_inside)
 
     def on_lanes(self, lane: Any) -> None:
         """See :meth:`difftetvr.rendering.traversal.crossing.Tracer.on_lanes`."""
@@ -64,16 +77,16 @@ class LinkedList:
     def trace(self, make_kernel: Callable[[Lanes], Kernel]) -> None:
         """Sort every ray's fragments and cross their cells, front to back."""
         for band in self.bands:
-            lists = self.raster.lists(band)
-            rays = lanes_of(self.view, band.first, band.last)
+            lists = FragmentLists.of(self.search, band)
+            rays = self.view.rays.of_lanes(band.lane)
             kernel = make_kernel(rays)
-            kernel.finish(self._resolve(kernel, rays, lists))
-            self.view.backend.run()  # before the lists of the next band
+            kernel.finish(self._resolve(kernel, rays, lists, band))
+            dr.eval()  # before the lists of the next band
 
-    def _resolve(self, kernel: Kernel, rays: Lanes, lists: FragmentLists) -> Any:
-        view, scene = self.view, self.raster.scene
+    def _resolve(self, kernel: Kernel, rays: Lanes, lists: FragmentLists, band: FragmentBand) -> Any:
+        view, scene = self.view, self.search.scene
         uint, real, lanes = view.backend.UInt, view.backend.Float, dr.width(rays.pixel)
-        heads = dr.gather(uint, lists.heads, dr.arange(uint, lanes), rays.valid)
+        heads = dr.gather(uint, lists.heads, band.lane - band.first, rays.valid)
 
         def batch(more: Any, depth: Any, face: Any, ray: Any) -> tuple[Any, ...]:
             heap = _Heap(view.backend, self.local_size, lanes)
@@ -98,6 +111,24 @@ class LinkedList:
             kernel.start(),
         )
         return dr.while_loop(state, lambda more, *_: more, batch)[3]
+
+
+def _bands(view: View, found: Fragments) -> list[FragmentBand]:
+    """All lanes, as many at a time as the budget lets."""
+    backend, lanes = view.backend, view.rays.lane_count
+    if found.total <= FRAGMENT_BUDGET:
+        parts = [Band(0, lanes, found.total)]
+    else:
+        parts = bands_of(backend.tensor(backend.Int(found.count)).long(), FRAGMENT_BUDGET)
+    bands = []
+    for part in parts:
+        count, first, last = part.last - part.first, backend.constant(part.first), backend.constant(part.last)
+        lane = backend.lanes(count)
+        if part.first:
+            lane = lane + first
+            dr.eval(lane)
+        bands.append(FragmentBand(lane, first, last, count, few_lengths(part.total)))
+    return bands
 
 
 class _Heap:
