@@ -9,7 +9,7 @@ import torch
 
 from difftetvr.mesh import TetMesh
 from difftetvr.rendering.clip_plane import clip_rays
-from difftetvr.rendering.rays import Rays, unit_vectors
+from difftetvr.rendering.rays import Rays, short_unit_vectors, unit_vectors
 
 KNOW_FLOAT64 = ("cpu", "cuda")
 """Devices that compute in float64."""
@@ -45,19 +45,21 @@ class PreparedRays:
         eye = rays.eye
         origins = (rays.origins.reshape(-1, 3) if eye is None else eye).to(device, dtype).expand_as(directions)
         near, far = (end.reshape(-1).to(device, dtype) for end in rays.ends)
-        directions = unit_vectors(directions)
+        is_narrow = rays.directions.dtype != torch.float64 and dtype == torch.float64
+        directions = short_unit_vectors(directions) if is_narrow else unit_vectors(directions)
         vertices = mesh.vertices.detach()
         low, high = vertices.amin(0).to(dtype), vertices.amax(0).to(dtype)
-        center, radius = 0.5 * (low + high), 0.5 * (high - low).square().sum().sqrt()
+        center, radius = torch.lerp(low, high, 0.5), 0.5 * torch.linalg.vector_norm(high - low)
         shift = ((center - origins.detach()) * directions.detach()).sum(1)
-        lines = torch.cat((origins + shift[:, None] * directions, directions), dim=1)
+        lines = torch.cat((torch.addcmul(origins, shift[:, None], directions), directions), dim=1)
         if clip_plane is not None:
             first, last = clip_rays(clip_plane, origins, directions, mesh.origin)
             near, far = torch.maximum(near, first), torch.minimum(far, last)
         sees_all: bool | torch.Tensor = False
         if clip_plane is None and not (near.requires_grad or far.requires_grad):
-            beyond = (shift.abs() + radius).mul(1.0 + 1e-5)
-            sees_all = ((near <= shift - 1.001 * radius) & (far >= beyond)).all()
+            # How far from the centre rays begin and end, at least: they see all where that is beyond the mesh.
+            away = torch.minimum(shift - near, far - (1.0 + 1e-5) * shift.abs())
+            sees_all = away.amin() >= 1.001 * radius if len(away) else away.new_ones((), dtype=torch.bool)
             sees_all = bool(sees_all) if device.type == "cpu" else sees_all
         begins_at_point = device.type == "cpu" and not sees_all and _are_one(origins, directions, near)
         return PreparedRays(lines, shift, near, far, sees_all, begins_at_point)
