@@ -25,6 +25,7 @@ from difftetvr.rendering.task import TRACERS, Content, RenderTask
 from difftetvr.rendering.traversal.crossing import Tracer
 from difftetvr.rendering.traversal.rays import KernelRays
 from difftetvr.rendering.upload import Extent, LaidOut, Upload, lay_out
+from difftetvr.rendering.viewpoints import Viewpoint
 
 RENDERERS = tuple(TRACERS)
 CAMERAS = "pass a difftetvr.Camera, a list of cameras, or difftetvr.Rays"
@@ -251,32 +252,8 @@ def _content(
         field = field.as_field()
     if field.harmonics is not None:
         field.validate(mesh)
-        field = _seen(mesh, field, camera)
+        field = Viewpoint.of(mesh, camera).seen(field, mesh)
     return location, (field.color, field.density)
-
-
-def _seen(mesh: TetMesh, field: Field, camera: Camera | Rays) -> Field:
-    """A field whose colours depend on the direction, as a camera or rays that share a viewpoint see it."""
-    if isinstance(camera, Camera):
-        return field.seen_from(mesh, camera.position)
-    rays = camera.relative_to(mesh.origin)
-    if (eye := rays.eye) is not None:
-        return field.seen_from(mesh, eye)
-    origins, directions = rays.origins.reshape(-1, 3), rays.directions.reshape(-1, 3)
-    if not len(origins):
-        return field.seen_from(mesh, mesh.vertices.new_zeros(3))
-    if _are_one(origins):
-        return field.seen_from(mesh, origins.mean(0))
-    if _are_one(directions):
-        return field.seen_along(directions.mean(0))
-    raise DiffTetError(
-        "The field's colours depend on the direction (harmonics), and are known here for rays that start at one point, "
-        "or go in one direction; ask for each camera by itself, or pass a field without harmonics."
-    )
-
-
-def _are_one(vectors: torch.Tensor) -> bool:
-    return bool((vectors.detach() == vectors[:1].detach()).all())
 
 
 def _camera_space(mesh: TetMesh, camera: Camera) -> torch.Tensor:

@@ -103,10 +103,7 @@ class Rays:
 
         No values are compared: rays with equal origins of their own may start at one point and not know it.
         """
-        sizes, strides = self.origins.shape[:-1], self.origins.stride()[:-1]
-        if 0 in sizes or any(size > 1 and stride != 0 for size, stride in zip(sizes, strides, strict=True)):
-            return None
-        return self.origins[(0,) * len(sizes)]
+        return one_vector(self.origins)
 
     @property
     def _starts(self) -> torch.Tensor:
@@ -186,6 +183,14 @@ class Rays:
             (b.origins.reshape(-1, 3), b.directions.reshape(-1, 3), *(e.reshape(-1) for e in b.ends)) for b in bundles
         ]
         return Rays(*(torch.cat(part) for part in zip(*parts, strict=True)))
+
+
+def one_vector(vectors: torch.Tensor) -> torch.Tensor | None:
+    """(3,) the one vector that (..., 3) vectors are in memory; None where they are several, or none."""
+    sizes, strides = vectors.shape[:-1], vectors.stride()[:-1]
+    if 0 in sizes or any(size > 1 and stride != 0 for size, stride in zip(sizes, strides, strict=True)):
+        return None
+    return vectors[(0,) * len(sizes)]
 
 
 def unit_vectors(vectors: torch.Tensor) -> torch.Tensor:
