@@ -15,9 +15,9 @@ class CameraRefinement(OptionGroup):
 
     prefix: ClassVar[str] = "cameras."
 
-    rate: float = 1e-2
+    rate: float = 2e-2
     """Greatest length of the first steps of a pose: radians, and half sides of the capture's box."""
-    final_rate: float = 1e-3
+    final_rate: float = 2e-3
     """Greatest length of the last steps; in between it falls log-linearly."""
     intrinsics_rate: float = 2e-4
     """Length of the steps of intrinsics at first, in parts of the focal length and of the image's width; it falls as

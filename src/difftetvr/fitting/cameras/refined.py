@@ -29,9 +29,6 @@ _BETAS, _EPSILON = (0.9, 0.99), 1e-15
 _KEPT = 0.5
 """Share of a view's curvature that stays when it is seen anew: it changes as the reconstruction grows sharp."""
 
-_SHARE = 0.8
-"""Of a step to where a view's image would fit best: the reconstruction is still to follow."""
-
 
 class RefinedCameras:
     """The cameras of a capture as they are now, and what moves them.
@@ -159,7 +156,7 @@ class RefinedCameras:
         is_known = known.diagonal(dim1=1, dim2=2).sum(1) > 0
         mean = torch.where(is_known[:, None, None], torch.lerp(found, known, _KEPT), found)
         self._state["motion_curvature"][rows] = mean
-        self.motion[rows] += _SHARE * gauss_newton_steps(gradient[rows], mean, rate / _SHARE)
+        self.motion[rows] += gauss_newton_steps(gradient[rows], mean, rate)
 
     def _hold_still(self) -> None:
         rows = self.motion[self._training]
