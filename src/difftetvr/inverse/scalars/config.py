@@ -61,7 +61,7 @@ class ScalarConfig(Schedule):
     """Learning rate in the last step; in between it falls log-linearly."""
     betas: tuple[float, float] = (0.9, 0.99)
     """Decay of Adam's first and second moments."""
-    total_variation: float = 0.0
+    total_variation: float = 1e-5
     """Weight of the total variation of scalars, in ranges of the function and faces of a cube of the box's volume: what
     images do not tell, such as where a function shows next to nothing, becomes flat."""
     knots: int = 32
