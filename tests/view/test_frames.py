@@ -123,12 +123,71 @@ def test_what_is_interrupted_leaves_nothing(tmp_path, name):
         assert list(tmp_path.iterdir()) == []
 
 
-def test_videos(tmp_path):
+@pytest.mark.parametrize("name", ["film.mp4", "film.webm"])
+def test_videos(tmp_path, name, capfd):
     reader = pytest.importorskip("imageio_ffmpeg")
-    assert save_film(tmp_path / "film.mp4", frames(5), 10.0) == 5
-    film = reader.read_frames(str(tmp_path / "film.mp4"))
+    assert save_film(tmp_path / name, frames(5), 10.0) == 5
+    film = reader.read_frames(str(tmp_path / name))
     about = next(film)
-    assert about["size"] == (30, 22) and about["fps"] == 10.0 and len(list(film)) == 5
+    assert about["size"] == (30, 22) and about["fps"] == 10.0
+    shown = [np.frombuffer(frame, np.uint8).reshape(22, 30, 3) for frame in film]
+    assert [frame[11, 15, 0] for frame in shown] == pytest.approx([0, 40, 80, 120, 160], abs=6)
+    # Players of large videos take another red than those of small ones, where none is named.
+    assert "bt709" in about["pix_fmt"]
+    assert capfd.readouterr() == ("", ""), "the encoder is silent"
+
+
+def test_films_of_a_kind_that_cannot_look_so(tmp_path):
+    pytest.importorskip("imageio_ffmpeg")
+    clear, point = Image.new("RGBA", (20, 20)), Image.new("RGB", (1, 20))
+    for name, frame, fps, said in (
+        ("film.mp4", clear, 10, "A .mp4 knows no shades of transparency"),
+        ("film.gif", clear, 10, "A .gif knows no shades of transparency"),
+        ("film.webm", point, 10, "1 x 20 pixels is too small"),
+        ("film.gif", point, 60, "at most 50 frames a second"),
+    ):
+        with pytest.raises(CaptureError, match=said):
+            save_film(tmp_path / name, [frame], fps)
+    assert list(tmp_path.iterdir()) == []
+    assert save_film(tmp_path / "film.webp", [clear], 10) == 1
+
+
+def test_animations_take_as_long_as_they_should(tmp_path):
+    for name, fps in (("film.gif", 30.0), ("film.webp", 24.0)):
+        save_film(tmp_path / name, frames(6), fps)
+        film, took = Image.open(tmp_path / name), []
+        for index in range(film.n_frames):
+            film.seek(index)
+            film.load()
+            took.append(film.info["duration"])
+        assert sum(took) == pytest.approx(1000 * 6 / fps, abs=0.1)
+
+
+@pytest.mark.parametrize("stop", [0, 2])
+def test_a_video_that_its_encoder_could_not_finish_is_none(tmp_path, monkeypatch, stop):
+    """As on a full disk, of which the encoder may learn while it closes the file."""
+    reader = pytest.importorskip("imageio_ffmpeg")
+    write = reader.write_frames
+
+    def failing(path, *args, **options):
+        encoder = write(path, *args, **options)
+        yield encoder.send(None)
+        count = 0
+        try:
+            while True:
+                encoder.send((yield))
+                count += 1
+                if count == stop:
+                    raise OSError("FFMPEG COMMAND:\nand more")
+        finally:
+            encoder.close()
+            with open(path, "r+b") as file:
+                file.truncate(100)
+
+    monkeypatch.setattr(reader, "write_frames", failing)
+    with pytest.raises(CaptureError, match=r"^Cannot write [^\n]*film\.mp4: the encoder [^\n]*$"):
+        save_film(tmp_path / "film.mp4", frames(4), 10.0)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_missing_package_is_named(tmp_path, monkeypatch):

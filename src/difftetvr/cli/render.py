@@ -208,15 +208,17 @@ class Render:
     ) -> None:
         from difftetvr.terminal import waiting
         from difftetvr.view.frames import framed, save_film
+        from difftetvr.view.frames.films import require_shown
 
         assert shots.fps is not None
+        camera, count = shots.cameras[0], counted(len(shots.cameras), "frame")
+        require_shown(self.output, (camera.width, camera.height), shots.fps, style.background is None)
 
         def frames() -> Iterator[Image]:
             for camera in shots.cameras:
                 image = subject.seen_by(camera)
                 yield framed(image.color, image.alpha, camera, style)
 
-        camera, count = shots.cameras[0], counted(len(shots.cameras), "frame")
         with waiting(console, f"Rendering {count}"):
             save_film(self.output, frames(), shots.fps)
         what = f"{count} of {camera.width} x {camera.height}, {shots.fps:g} a second"
