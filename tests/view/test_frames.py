@@ -1,5 +1,6 @@
 """Pictures with what is around a volume, and films of them."""
 
+import itertools
 import sys
 
 import numpy as np
@@ -10,7 +11,9 @@ from PIL import Image
 import difftetvr as dtv
 from difftetvr.errors import CaptureError
 from difftetvr.view.frames import AxesBox, ColorScale, FrameStyle, framed, save_film
-from difftetvr.view.frames.color_bar import beside_color_bar
+from difftetvr.view.frames.axes import ProjectedBox
+from difftetvr.view.frames.color_bar import beside_color_bar, draw_color_bar
+from difftetvr.view.frames.lettering import Ink, Layer
 
 CAMERA = dtv.Camera.look_at((2.0, -3.0, 2.0), (0.5, 0.5, 0.5), width=200, height=160)
 BOX = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
@@ -74,9 +77,41 @@ def test_a_colour_bar_has_the_colours_of_its_function_and_numbers_in_its_range()
 def test_a_logarithmic_bar():
     scale = ColorScale("p", (1.0, 1000.0), FUNCTION, is_log=True)
     places = {label: place for place, label in scale.ticks()}
-    assert places["$10^{1}$"] == pytest.approx(1 / 3) and places["$10^{2}$"] == pytest.approx(2 / 3)
+    assert places["10¹"] == pytest.approx(1 / 3) and places["10²"] == pytest.approx(2 / 3)
     assert float(scale.colors(4)[1, 0]) == pytest.approx(9 / 999)
     assert all(0 <= place <= 1 for place, _ in ColorScale("p", (2.0, 5.0), FUNCTION, is_log=True).ticks())
+
+
+def test_words_stand_apart_within_the_picture(recwarn):
+    """However flat the box, however long the numbers and the name of the scalar, and whatever that is."""
+    for size, bounds, ends, is_log, label in (
+        (512, BOX * torch.tensor([4.0, 4.0, 1.0]) - 2.0, (0.5, 1.2), False, "p"),
+        (256, BOX + 1e5, (1e60, 1e300), True, "$x_{$ \\foo"),
+        (200, 1e30 * BOX.double(), (1e-3, 1e-1), True, "a name that goes on and on " * 9),
+    ):
+        middle = bounds.double().mean(0)
+        eye = middle + 3.0 * float(bounds[1, 0] - bounds[0, 0]) * torch.tensor([0.5, -0.8, 0.5], dtype=torch.float64)
+        box = AxesBox(bounds, unit="mm")
+        layer = Layer(size, size, Ink("white", "black"))
+        draw_color_bar(layer, ColorScale(label, ends, FUNCTION, is_log))
+        ProjectedBox(box, dtv.Camera.look_at(eye, middle, width=size, height=size)).draw_numbers(layer)
+        words = layer.words
+        assert sum("(mm)" in text for text, _ in words) == 3
+        boxes = [box for _, box in words]
+        assert all(0 <= box.left and box.right <= size and 0 <= box.top and box.bottom <= size for box in boxes)
+        assert not any(one.meets(other, 0.0) for one, other in itertools.combinations(boxes, 2))
+    assert not recwarn.list
+
+
+def test_small_letters_are_whole():
+    """Matplotlib moves straight lines to pixels, and so leaves bars of letters out."""
+    for part in range(8):
+        layer = Layer(40, 20, Ink("white", "black"))
+        layer.text((20.0, 10.0 + part / 8), "E")
+        drawn = np.asarray(layer.drawn()).astype(int)
+        bright = drawn[..., 0] * drawn[..., 3] // 255
+        lit = bright[:, np.flatnonzero((bright > 100).any(0))[-2]] > 60
+        assert np.count_nonzero(lit[1:] & ~lit[:-1]) == 3, "an E has three bars"
 
 
 def test_a_bar_beside_a_picture_leaves_it_as_it_is():
