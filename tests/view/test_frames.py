@@ -98,7 +98,7 @@ def test_words_stand_apart_within_the_picture(recwarn):
         words = layer.words
         assert sum("(mm)" in text for text, _ in words) == 3
         boxes = [box for _, box in words]
-        assert all(0 <= box.left and box.right <= size and 0 <= box.top and box.bottom <= size for box in boxes)
+        assert all(min(box.left, box.top, size - box.right, size - box.bottom) >= 0.0 for box in boxes)
         assert not any(one.meets(other, 0.0) for one, other in itertools.combinations(boxes, 2))
     assert not recwarn.list
 
