@@ -12,9 +12,12 @@ import pytest
 import torch
 
 import difftetvr as dtv
+from difftetvr.capture.truth import BLACK, Truth
 from difftetvr.fitting import CameraRefinement, RefinedCameras
-from difftetvr.fitting.cameras.curvature import gauss_newton_steps
+from difftetvr.fitting.cameras.alignment import StillWorld, align_held_out
+from difftetvr.fitting.cameras.curvature import WorldMotion, gauss_newton_steps, pose_curvature
 from difftetvr.fitting.cameras.refined import rotation_of
+from difftetvr.fitting.processes import ALONE
 from difftetvr.fitting.records.folder import RunFolder
 
 REPORT = importlib.import_module("difftetvr.view.report")
@@ -150,6 +153,28 @@ def test_curvature_is_near_that_of_images_that_were_rendered_again() -> None:
     found = cameras.curvature_of(cameras.known(3), seen, torch.ones_like(seen.color))
     ratios = torch.linalg.eigvals(torch.linalg.solve(expected, found)).real
     assert float(ratios.min()) > 0.3 and float(ratios.max()) < 1.6, ratios
+
+
+def test_a_camera_in_the_middle_of_its_world_has_a_curvature() -> None:
+    """Also where it sees nothing, which is taken to be as far away as the middle."""
+    mesh = dtv.TetMesh.grid((4, 4, 4), (-1, -1, -1), (1, 1, 1))
+    x, y, _ = mesh.vertices.T
+    field = dtv.Field(torch.rand(len(x), 3), 0.5 * ((x > 0.9) & (y > 0.0)))
+    camera = dtv.Camera.look_at((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), width=8, height=8)
+    image = dtv.render(mesh, field, camera)
+    assert not image.alpha.all()
+    motion = WorldMotion(torch.zeros(3, dtype=torch.float64), 1.0)
+    found = pose_curvature(camera, image, torch.ones_like(image.color), motion)
+    assert bool(torch.isfinite(found).all()) and bool(found.any())
+
+
+def test_held_out_views_of_nothing_stay_where_they_are(ball: dtv.Capture) -> None:
+    mesh = dtv.TetMesh.grid((2, 2, 2), (-1, -1, -1), (1, 1, 1))
+    empty = dtv.Field(torch.rand(mesh.num_vertices, 3), torch.zeros(mesh.num_vertices))
+    cameras = RefinedCameras(ball, OPTIONS, True, False)
+    world = StillWorld(mesh, empty, Truth(ball, torch.device("cpu")), BLACK, False)
+    align_held_out(cameras, OPTIONS, world, [2, 8], ALONE)
+    assert not bool(cameras.motion.any())
 
 
 def test_refined_poses_explain_the_images_better(ball: dtv.Capture, shaken: dtv.Capture) -> None:

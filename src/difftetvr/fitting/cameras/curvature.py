@@ -88,9 +88,10 @@ def _flow(camera: Camera, image: RenderedImage, motion: WorldMotion) -> torch.Te
     pose = camera.world_to_camera.detach()
     rotation, dtype = pose[:3, :3].to(image.depth), image.depth.dtype
     middle = (pose[:3, :3].double() @ motion.center.to(pose.device) + pose[:3, 3].double()).to(image.depth)
-    depth = torch.where(image.alpha.detach() > _LEAST_ALPHA, image.depth.detach(), middle.norm())
+    away = middle.norm().clamp(min=motion.unit)  # where nothing is: as far as the middle, in which a camera may be
+    depth = torch.where(image.alpha.detach() > _LEAST_ALPHA, image.depth.detach(), away)
     points = depth[..., None] * camera.ray_directions().detach().to(image.depth)
-    x, y, z = points[..., 0], points[..., 1], points[..., 2].clamp(min=1e-6 * float(middle.norm()))
+    x, y, z = points[..., 0], points[..., 1], points[..., 2].clamp(min=1e-6 * motion.unit)
     zero, (fx, fy) = torch.zeros_like(z), (float(camera.fx), float(camera.fy))
     columns = torch.stack((fx / z, zero, -fx * x / z.square()), dim=-1)
     rows = torch.stack((zero, fy / z, -fy * y / z.square()), dim=-1)
