@@ -135,13 +135,18 @@ def test_steps_lead_to_the_least_value_of_a_quadratic_model_and_are_not_too_long
     assert not gauss_newton_steps(torch.zeros(1, 6).double(), torch.zeros(1, 6, 6).double(), 0.1).any()
 
 
-def test_curvature_is_near_that_of_images_that_were_rendered_again() -> None:
+@pytest.mark.parametrize("is_fisheye", [False, True])
+def test_curvature_is_near_that_of_images_that_were_rendered_again(is_fisheye: bool) -> None:
     """It is taken from the slopes of one image, so it is that of an image a little blurred: rather smaller."""
     mesh = dtv.TetMesh.grid((8, 8, 8), (-1, -1, -1), (1, 1, 1), dtype=torch.float64)
     density = 8.0 * (0.9 - mesh.vertices.norm(dim=1)).clamp(min=0.0)
     field = dtv.Field(0.5 + 0.5 * torch.sin(2.0 * mesh.vertices), density)
     capture = capture_of(views=5, size=64)
     views = [camera.with_pose(camera.world_to_camera.double()) for camera in capture.cameras]
+    if is_fisheye:
+        pose = dtv.Camera.look_at((0.0, 0.5, 1.1), (1.5, 0.0, 0.0)).world_to_camera.double()
+        views[3] = dtv.LensCamera(pose, 24.0, 24.0, 32.0, 32.0, 64, 64, model="fisheye", coefficients=[-0.05])
+        assert bool(views[3].ray_directions().isnan().any())
     cameras = RefinedCameras(dataclasses.replace(capture, cameras=views), OPTIONS, True, False)
     seen, lens, step = dtv.render(mesh, field, cameras.known(3)), torch.zeros(3, dtype=torch.float64), 1e-4
     columns = []
