@@ -104,7 +104,9 @@ def _flow(camera: Camera, image: RenderedImage, motion: WorldMotion) -> torch.Te
 def _pixels_by_direction(directions: torch.Tensor) -> torch.Tensor:
     """(H, W, 2, 3) derivatives of columns and rows by (H, W, 3) directions, from those of neighbours: of any lens."""
     across, down = _slopes(directions, 1), _slopes(directions, 0)
-    aa, ad, dd = ((one * other).sum(-1, keepdim=True) for one, other in ((across, across), (across, down), (down, down)))
+    aa, ad, dd = (
+        (one * other).sum(-1, keepdim=True) for one, other in ((across, across), (across, down), (down, down))
+    )
     # An image of one row or column has no slope along the other axis, by which this is multiplied.
     aa, dd = (torch.where(square > 0, square, 1.0) for square in (aa, dd))
     determinant = aa * dd - ad * ad
