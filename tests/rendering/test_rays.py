@@ -208,6 +208,19 @@ def in_a_plane(origins: Tensor, directions: Tensor) -> Tensor:
     return (flat & on_grid).any(1)
 
 
+@pytest.mark.parametrize("renderer", ["marching", "linked-list"])
+def test_no_ray_is_lost_in_float64_where_float32_was_first(renderer: str) -> None:
+    """Meshes of both precisions share a topology, and what is kept with it; rays pass a billionth from the sides."""
+    grid = TetMesh.grid((3, 3, 3), dtype=torch.float64)
+    mesh = grid.with_vertices((grid.vertices + 1.0) / 3.0)
+    field = Field(torch.ones(mesh.num_vertices, 3).double(), torch.ones(mesh.num_vertices).double())
+    render(mesh.to(dtype=torch.float32), field.to(dtype=torch.float32), Rays(*random_rays(4)), renderer=renderer)
+    low, high = (1.0 + 1e-9) / 3.0, (2.0 - 1e-9) / 3.0
+    origins = torch.tensor([[x, y, -1.0] for x in (low, 0.4, high) for y in (low, 0.6, high)], dtype=torch.float64)
+    seen = render(mesh, field, Rays(origins, torch.tensor([0.0, 0.0, 1.0]).double()), renderer=renderer)
+    torch.testing.assert_close(seen.optical_depth, torch.full((9,), 1.0 / 3.0).double())
+
+
 @given(seed=st.integers(0, 2**31), cut=st.floats(0.0, 3.0))
 @settings(max_examples=20, deadline=None)
 def test_what_is_before_and_behind_a_distance_adds_up(seed: int, cut: float) -> None:

@@ -83,6 +83,8 @@ def _aligned(cameras: RefinedCameras, options: CameraRefinement, world: StillWor
         else:
             longest = _SHORTER * min(longest, float(torch.maximum(step[:3].norm(), step[3:].norm())))
         step = gauss_newton_steps(gradient[None], curvature[None], longest)[0]
+        if not bool(step.any()):  # the image does not depend on the pose: nothing is seen, say
+            break
         motion = best + step
     found: list[float] = best.tolist()
     return found

@@ -84,18 +84,30 @@ def _slopes(color: torch.Tensor, axis: int) -> torch.Tensor:
 
 
 def _flow(camera: Camera, image: RenderedImage, motion: WorldMotion) -> torch.Tensor:
-    """(H, W, 2, 6) by how many columns and rows what is seen at a pixel moves."""
+    """(H, W, 2, 6) by how many columns and rows what is seen at a pixel moves; 0 where the camera has no ray."""
     pose = camera.world_to_camera.detach()
-    rotation, dtype = pose[:3, :3].to(image.depth), image.depth.dtype
+    rotation = pose[:3, :3].to(image.depth)
     middle = (pose[:3, :3].double() @ motion.center.to(pose.device) + pose[:3, 3].double()).to(image.depth)
-    depth = torch.where(image.alpha.detach() > _LEAST_ALPHA, image.depth.detach(), middle.norm())
-    points = depth[..., None] * camera.ray_directions().detach().to(image.depth)
-    x, y, z = points[..., 0], points[..., 1], points[..., 2].clamp(min=1e-6 * float(middle.norm()))
-    zero, (fx, fy) = torch.zeros_like(z), (float(camera.fx), float(camera.fy))
-    columns = torch.stack((fx / z, zero, -fx * x / z.square()), dim=-1)
-    rows = torch.stack((zero, fy / z, -fy * y / z.square()), dim=-1)
+    away = middle.norm().clamp(min=motion.unit)  # where nothing is: as far as the middle, in which a camera may be
+    depth = torch.where(image.alpha.detach() > _LEAST_ALPHA, image.depth.detach(), away)[..., None]
+    directions = camera.ray_directions().detach()
+    columns_and_rows = _pixels_by_direction(directions).to(depth) / depth[..., None]
     # In the axes of the world: a rotation vector w moves what is at an arm a by w x a.
-    u, v, w = ((points - middle) @ rotation).unbind(-1)
+    u, v, w = ((depth * directions.to(depth) - middle) @ rotation).unbind(-1)
+    zero = torch.zeros_like(u)
     turns = torch.stack((zero, w, -v, -w, zero, u, v, -u, zero), dim=-1).unflatten(-1, (3, 3))
-    shifts = (motion.unit * torch.eye(3, dtype=dtype, device=z.device)).expand_as(turns)
-    return torch.stack((columns, rows), dim=-2) @ (rotation @ torch.cat((turns, shifts), dim=-1))
+    shifts = (motion.unit * torch.eye(3).to(turns)).expand_as(turns)
+    flow = columns_and_rows @ (rotation @ torch.cat((turns, shifts), dim=-1))
+    return torch.where(torch.isfinite(flow).all(-1, keepdim=True).all(-2, keepdim=True), flow, 0.0)
+
+
+def _pixels_by_direction(directions: torch.Tensor) -> torch.Tensor:
+    """(H, W, 2, 3) derivatives of columns and rows by (H, W, 3) directions, from those of neighbours: of any lens."""
+    across, down = _slopes(directions, 1), _slopes(directions, 0)
+    aa, ad, dd = (
+        (one * other).sum(-1, keepdim=True) for one, other in ((across, across), (across, down), (down, down))
+    )
+    # An image of one row or column has no slope along the other axis, by which this is multiplied.
+    aa, dd = (torch.where(square > 0, square, 1.0) for square in (aa, dd))
+    determinant = aa * dd - ad * ad
+    return torch.stack((dd * across - ad * down, aa * down - ad * across), dim=-2) / determinant[..., None]

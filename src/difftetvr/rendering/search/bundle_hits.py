@@ -113,8 +113,8 @@ class BundleEntries:
     def settled(self, scene: Scene, found: Found, told: Told) -> EntryLists:
         """See :meth:`difftetvr.rendering.search.plan.SearchPlan.settled`."""
         boundary, *rest = found.boxes
-        cells = None if self.cells is None else Hierarchy(self.cells, rest[0])
-        search = _BundleSearch(scene, self, Hierarchy(self.boundary, boundary), cells, found.around)
+        cells = None if self.cells is None else Hierarchy(scene.backend, self.cells, rest[0])
+        search = _BundleSearch(scene, self, Hierarchy(scene.backend, self.boundary, boundary), cells, found.around)
         return list_entries(search, found.counts, told, self.stretches.limits is not None and not told.sees_all)
 
 

@@ -51,10 +51,9 @@ class SortedItems:
 
 @dataclass
 class Leaves:
-    """Items of a hierarchy as kernels read them, wherever they are.
+    """Items of a hierarchy as kernels of any precision read them, wherever they are.
 
     Attributes:
-        backend: Array types.
         items: (N,) numbers of the items, those of a leaf next to each other.
         corners: Flat (N, K) vertices.
         width: K.
@@ -66,7 +65,6 @@ class Leaves:
         first: L, as a device value.
     """
 
-    backend: Backend
     items: Any
     corners: Any
     width: int
@@ -83,7 +81,6 @@ class Leaves:
         count, width = sorted_items.corners.shape
         level = max(0, -(-count // leaf_items) - 1).bit_length()
         return Leaves(
-            backend,
             backend.uints(sorted_items.items),
             backend.uints(sorted_items.corners),
             width,
@@ -116,18 +113,20 @@ class Hierarchy:
     """Boxes around boxes around some items.
 
     Attributes:
+        backend: Array types.
         leaves: The items.
         boxes: (2 L, 8) least and negated greatest coordinates of each node, and two of padding; infinite where it has
             no items.
     """
 
+    backend: Backend
     leaves: Leaves
     boxes: Any
 
     @staticmethod
     def over(leaves: Leaves, cells: Cells) -> Hierarchy:
-        """Build the boxes of items with vertices of some cells; may be recorded."""
-        backend = leaves.backend
+        """Build the boxes of items with vertices of some cells, in their precision; may be recorded."""
+        backend = cells.backend
         boxes, below = (dr.empty(backend.Float, size << leaves.level) for size in (16, 8))
         box = _leaf_boxes(leaves, cells)
         _store(backend, below, leaves.leaf, box)
@@ -136,12 +135,12 @@ class Hierarchy:
         level = leaves.level
         for above, node in zip(_levels_above(level), leaves.above, strict=True):
             below, level = _raised(backend, boxes, below, node, (level, above)), above
-        return Hierarchy(leaves, boxes)
+        return Hierarchy(backend, leaves, boxes)
 
     @property
     def size(self) -> Any:
         """Greatest coordinate of any box."""
-        low, high = _box(self.leaves.backend, self.boxes, self.leaves.backend.UInt(1))
+        low, high = _box(self.backend, self.boxes, self.backend.UInt(1))
         return largest_coordinate([low, high])
 
     def meet_lines(
@@ -214,8 +213,8 @@ class Hierarchy:
         state: Any,
         is_done: Callable[[Any], Any] | None = None,
     ) -> Any:
-        leaves = self.leaves
-        backend, uint, count = leaves.backend, leaves.backend.UInt, leaves.leaf_items
+        leaves, backend = self.leaves, self.backend
+        uint, count = backend.UInt, leaves.leaf_items
 
         def at_item(place: Any, state: Any) -> tuple[Any, Any]:
             is_there = place < leaves.count
@@ -287,8 +286,8 @@ def _store(backend: Backend, boxes: Any, node: Any, ends: list[Any]) -> None:
 
 def _leaf_boxes(leaves: Leaves, cells: Cells) -> list[Any]:
     """Least and negated greatest coordinates of the leaves."""
-    uint = leaves.backend.UInt
-    ends = [leaves.backend.Float(dr.inf) for _ in range(6)]
+    uint = cells.backend.UInt
+    ends = [cells.backend.Float(dr.inf) for _ in range(6)]
     for k in range(leaves.leaf_items):
         item = leaves.leaf_items * leaves.leaf + k
         is_there = item < leaves.count

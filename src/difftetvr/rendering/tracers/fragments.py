@@ -163,7 +163,7 @@ class BundleFragments:
 
     def settled(self, scene: Scene, found: Found, told: Told) -> Fragments:
         """See :meth:`difftetvr.rendering.search.plan.SearchPlan.settled`."""
-        search = _BundleFragmentSearch(scene, self, Hierarchy(self.cells, found.boxes[0]))
+        search = _BundleFragmentSearch(scene, self, Hierarchy(scene.backend, self.cells, found.boxes[0]))
         return Fragments(search, found.counts.count, told.most, told.total, False)
 
 

@@ -7,7 +7,7 @@ complexity. The image is made in bands when the lists of all pixels together wou
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -46,14 +46,14 @@ class LinkedList:
     Attributes:
         view: What kernels read.
         search: Finds fragments.
-        bands: Parts of the image whose lists fit the budget.
+        bands: All of the image; or, one after the other, parts of it whose lists fit the budget.
         local_size: Fragments that a ray sorts at a time.
         starts_inside: Whether some crossings begin behind the camera.
     """
 
     view: View
     search: Search
-    bands: list[FragmentBand]
+    bands: FragmentBand | ManyBands
     local_size: int
     starts_inside: bool
 
@@ -76,12 +76,18 @@ class LinkedList:
 
     def trace(self, make_kernel: Callable[[Lanes], Kernel]) -> None:
         """Sort every ray's fragments and cross their cells, front to back."""
-        for band in self.bands:
-            lists = FragmentLists.of(self.search, band)
-            rays = self.view.rays.of_lanes(band.lane)
-            kernel = make_kernel(rays)
-            kernel.finish(self._resolve(kernel, rays, lists, band))
-            dr.eval()  # before the lists of the next band
+        if isinstance(self.bands, FragmentBand):
+            self._trace_band(make_kernel, self.bands)
+            return
+        for band in self.bands.each(self.view.backend):
+            self._trace_band(make_kernel, band)
+            self.view.backend.run()  # before the lists of the next band
+
+    def _trace_band(self, make_kernel: Callable[[Lanes], Kernel], band: FragmentBand) -> None:
+        lists = FragmentLists.of(self.search, band)
+        rays = self.view.rays.of_lanes(band.lane)
+        kernel = make_kernel(rays)
+        kernel.finish(self._resolve(kernel, rays, lists, band))
 
     def _resolve(self, kernel: Kernel, rays: Lanes, lists: FragmentLists, band: FragmentBand) -> Any:
         view, scene = self.view, self.search.scene
@@ -113,22 +119,32 @@ class LinkedList:
         return dr.while_loop(state, lambda more, *_: more, batch)[3]
 
 
-def _bands(view: View, found: Fragments) -> list[FragmentBand]:
+class ManyBands:
+    """Bands that must be waited for, each before the next: a recording would not, and hold the lists of several."""
+
+    def __init__(self, parts: list[Band]) -> None:
+        self._parts = parts
+
+    def each(self, backend: Backend) -> Iterator[FragmentBand]:
+        """The bands, one after the other."""
+        return (_band(backend, part) for part in self._parts)
+
+
+def _bands(view: View, found: Fragments) -> FragmentBand | ManyBands:
     """All lanes, as many at a time as the budget lets."""
     backend, lanes = view.backend, view.rays.lane_count
-    if found.total <= FRAGMENT_BUDGET:
-        parts = [Band(0, lanes, found.total)]
-    else:
-        parts = bands_of(backend.tensor(backend.Int(found.count)).long(), FRAGMENT_BUDGET)
-    bands = []
-    for part in parts:
-        count, first, last = part.last - part.first, backend.constant(part.first), backend.constant(part.last)
-        lane = backend.lanes(count)
-        if part.first:
-            lane = lane + first
-            dr.eval(lane)
-        bands.append(FragmentBand(lane, first, last, count, few_lengths(part.total)))
-    return bands
+    # The total may have run over where it could be so great.
+    if found.total <= FRAGMENT_BUDGET and found.longest * lanes < 1 << 32:
+        return _band(backend, Band(0, lanes, found.total))
+    parts = bands_of(backend.tensor(backend.Int(found.count)).long(), FRAGMENT_BUDGET)
+    return _band(backend, parts[0]) if len(parts) == 1 else ManyBands(parts)
+
+
+def _band(backend: Backend, part: Band) -> FragmentBand:
+    count, first, last = part.last - part.first, backend.constant(part.first), backend.constant(part.last)
+    lane = dr.arange(backend.UInt, count) + first if part.first else backend.lanes(count)
+    dr.eval(lane)
+    return FragmentBand(lane, first, last, count, few_lengths(part.total))
 
 
 class _Heap:
