@@ -18,9 +18,12 @@ EXCHANGE = FitConfig(cells=500, iterations=14, evaluate_every=5, device="cpu", e
 CONFIGS = {
     "exchange": EXCHANGE,
     "bands": dataclasses.replace(EXCHANGE, iterations=6, harmonics=1, exchange=Exchange(rounds=2, views=3)),
+    "poses": dataclasses.replace(
+        EXCHANGE, iterations=6, refine_poses=True, refine_intrinsics=True, exchange=Exchange(rounds=2, views=3)
+    ),
     "star": dataclasses.replace(EXCHANGE, iterations=10, refine="star", star=Star(views=3, initial=0.2)),
 }
-"""Each refines its mesh; the second has a bundle of rays for each view, the others one for all."""
+"""Each refines its mesh; the second has a bundle of rays for each view, the others one for all. One moves cameras."""
 
 
 def state_of(trainer):

@@ -50,9 +50,12 @@ def pose_curvature(camera: Camera, image: RenderedImage, weights: torch.Tensor, 
         across, down = _slopes(image.color.detach(), 1), _slopes(image.color.detach(), 0)
         products = (across * across, across * down, down * down)
         xx, xy, yy = ((weights * product).sum(-1) for product in products)
-        tensor = torch.stack((xx, xy, xy, yy), dim=-1).reshape(-1, 2, 2)
-        flow = _flow(camera, image, motion).to(tensor).reshape(-1, 2, 6)
-        curvature = 2.0 * torch.einsum("pia,pij,pjb->ab", flow, tensor, flow)
+        column, row = _flow(camera, image, motion).unbind(-2)
+        by_column = xx[..., None] * column + xy[..., None] * row
+        by_row = xy[..., None] * column + yy[..., None] * row
+        # No products of millions of small matrices, which are slow.
+        one, other = (torch.cat((x.reshape(-1, 6), y.reshape(-1, 6))) for x, y in ((column, row), (by_column, by_row)))
+        curvature = 2.0 * (one.T @ other)
         return curvature.cpu().double()
 
 
@@ -90,14 +93,14 @@ def _flow(camera: Camera, image: RenderedImage, motion: WorldMotion) -> torch.Te
     middle = (pose[:3, :3].double() @ motion.center.to(pose.device) + pose[:3, 3].double()).to(image.depth)
     away = middle.norm().clamp(min=motion.unit)  # where nothing is: as far as the middle, in which a camera may be
     depth = torch.where(image.alpha.detach() > _LEAST_ALPHA, image.depth.detach(), away)[..., None]
-    directions = camera.ray_directions().detach()
-    columns_and_rows = _pixels_by_direction(directions).to(depth) / depth[..., None]
-    # In the axes of the world: a rotation vector w moves what is at an arm a by w x a.
-    u, v, w = ((depth * directions.to(depth) - middle) @ rotation).unbind(-1)
-    zero = torch.zeros_like(u)
-    turns = torch.stack((zero, w, -v, -w, zero, u, v, -u, zero), dim=-1).unflatten(-1, (3, 3))
-    shifts = (motion.unit * torch.eye(3).to(turns)).expand_as(turns)
-    flow = columns_and_rows @ (rotation @ torch.cat((turns, shifts), dim=-1))
+    # Made where the image is, and not on the host for each iteration.
+    directions = camera.with_pose(pose.to(depth.device)).ray_directions().detach().to(depth)
+    columns_and_rows = _pixels_by_direction(directions) / depth[..., None]
+    # In the axes of the world: a rotation vector w moves what is at an arm a by w x a, and g (w x a) = w (a x g).
+    arms = (depth * directions - middle) @ rotation
+    shifts = columns_and_rows @ rotation
+    turns = torch.linalg.cross(arms[..., None, :].expand_as(shifts), shifts)
+    flow = torch.cat((turns, motion.unit * shifts), dim=-1)
     return torch.where(torch.isfinite(flow).all(-1, keepdim=True).all(-2, keepdim=True), flow, 0.0)
 
 

@@ -194,20 +194,20 @@ class ScalarReconstruction(AdaptiveRun):
         if self.knots is not None and hand_on is not None:
             self.knots.zero_grad()
             hand_on(None)
-        return [total + self._penalise(mesh), total]
+        return [total + self._penalise(mesh).to(total), total]
 
-    def _penalise(self, mesh: TetMesh) -> float:
+    def _penalise(self, mesh: TetMesh) -> torch.Tensor:
         """Adds the derivatives of the scalars' total variation; returns what it costs."""
         weight, scalars = self.config.total_variation, self.scalars.values
         if not weight or scalars.grad is None:
-            return 0.0
+            return torch.zeros(())
         side = float((self.capture.bounds[1] - self.capture.bounds[0]).double().prod() ** (1.0 / 3.0))
         found = total_variation(mesh, scalars.detach(), _ROUNDING / side)
         weight /= side * side
         scalars.grad += (weight * found.by_density).to(scalars)
         if mesh.vertices.grad is not None:
             mesh.vertices.grad += (weight * found.by_vertex).to(mesh.vertices)
-        return weight * float(found.value)
+        return weight * found.value
 
     def _error(self, mesh: TetMesh, field: ScalarField, view: int) -> torch.Tensor:
         """Mean squared error of a view."""

@@ -43,10 +43,8 @@ class Counts:
 
     @staticmethod
     def of(count: Any, half_faces: Any | None) -> Counts:
-        """From what each ray has."""
-        # Of no rays there is no maximum.
-        ends = (dr.max(count), dr.sum(count)) if dr.width(count) else (dr.zeros(type(count), 1) for _ in range(2))
-        most, total = ends
+        """From what each ray has, of one at least; a total of 2^32 and more runs over."""
+        most, total = dr.max(count), dr.sum(count)
         dr.eval(most, total)
         return Counts(count, half_faces, most, total)
 
