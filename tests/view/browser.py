@@ -78,7 +78,7 @@ class Browser:
                 return answer["result"]
             self._note(answer)
 
-    def open(self, page: Path) -> None:
+    def open(self, page: Path, hash: str = "") -> None:
         """Opens a page and waits until its script has begun."""
         self.call("Page.navigate", url=page.resolve().as_uri())
         self.wait_for("window.difftetvr || document.querySelector('.failure')")
