@@ -1,7 +1,8 @@
 """What a call costs beside its rays, and what a mesh's order in memory does to it.
 
-- An image of 8 x 8 pixels of 384 cells: next to nothing is computed, so this is the time of the host; and how many
-  kernels a call launches, traces and compiles once all are there.
+- An image of 8 x 8 pixels of 384 cells: next to nothing is computed, so this is the time of the host; by each renderer,
+  and along bundles of rays that see all of the mesh, or begin among its cells. How many kernels a call launches, traces
+  and compiles once all are there.
 - A grid of 64^3 cubes, six cells each, as it is made and with its vertices and cells shuffled, and a mesh after forty
   rounds in which edges were halved and others collapsed, as it is and sorted along a curve. Pairs alternate in one
   process.
@@ -25,16 +26,18 @@ import difftetvr as dtv
 from difftetvr.mesh.changes.bisection import bisect_edges
 from difftetvr.mesh.changes.collapse import collapse_edges
 from difftetvr.mesh.topology.topology import Topology
+from difftetvr.rendering.preparation import RENDERERS
 from difftetvr.rendering.search.hierarchy import curve_order
 
 Passes = tuple[float, float]
 
 
-def passes(mesh: dtv.TetMesh, camera: dtv.Camera) -> Passes:
+def passes(mesh: dtv.TetMesh, rays: dtv.Camera | dtv.Rays, renderer: str = "marching", moves: bool = True) -> Passes:
     """Seconds of a rendering and of its backward pass, of colours and densities that depend on the place."""
-    leaves = [part.clone().requires_grad_() for part in (mesh.vertices, mesh.vertices, mesh.vertices.square().sum(1))]
+    leaves = [part.clone().requires_grad_() for part in (mesh.vertices, mesh.vertices.square().sum(1))]
+    mesh = mesh.with_vertices(mesh.vertices.clone().requires_grad_(moves))
     start = time.perf_counter()
-    image = dtv.render(mesh.with_vertices(leaves[0]), dtv.Field(leaves[1], leaves[2]), camera)
+    image = dtv.render(mesh, dtv.Field(*leaves), rays, renderer=renderer)
     middle = time.perf_counter()
     (image.color.sum() + image.optical_depth.sum()).backward()
     return middle - start, time.perf_counter() - middle
@@ -84,14 +87,22 @@ def show_host_time(console: Console, repetitions: int) -> None:
     """Time and kernels of calls in which next to nothing is computed."""
     mesh = dtv.TetMesh.grid((4, 4, 4))
     camera = dtv.Camera.look_at((3.0, 2.5, 2.0), (0.5, 0.5, 0.5), width=8, height=8)
-    turns({"": lambda: passes(mesh, camera)}, 20)
-    rows = turns({"": lambda: passes(mesh, camera)}, 30 * repetitions)[""]
-    table = Table(title=f"{mesh.num_cells} cells, 8 x 8 pixels")
-    for heading in ("", "best ms", "median ms"):
-        table.add_column(heading, justify="left" if not heading else "right")
-    for name, place in (("render", 0), ("backward", 1)):
-        ordered = sorted(row[place] for row in rows)
-        table.add_row(name, f"{1e3 * ordered[0]:.2f}", f"{1e3 * ordered[len(ordered) // 2]:.2f}")
+    inside = dtv.Rays(*(torch.rand(2, 64, 3, generator=torch.Generator().manual_seed(0)) + 0.01))
+    calls: dict[str, Callable[[], Passes]] = {"camera, marching, vertices too": lambda: passes(mesh, camera)}
+    for renderer in RENDERERS:
+        calls[f"camera, {renderer}"] = lambda renderer=renderer: passes(mesh, camera, renderer, False)
+    for renderer in RENDERERS[:2]:
+        for name, rays in (("bundle", camera.rays()), ("bundle that begins among cells", inside)):
+            calls[f"{name}, {renderer}"] = lambda rays=rays, renderer=renderer: passes(mesh, rays, renderer, False)
+    turns(calls, 20)
+    times = turns(calls, 30 * repetitions)
+    table = Table(title=f"{mesh.num_cells} cells, 8 x 8 rays, best and median ms")
+    for heading in ("", "render", "", "backward", ""):
+        table.add_column(heading, justify="left" if not table.columns else "right")
+    for name, rows in times.items():
+        ordered = [sorted(row[place] for row in rows) for place in range(2)]
+        numbers = [f"{1e3 * column[place]:.2f}" for column in ordered for place in (0, len(column) // 2)]
+        table.add_row(name, *numbers)
     console.print(table)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         passes(mesh, camera)  # recorded anew where the flag is set

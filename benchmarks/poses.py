@@ -16,6 +16,7 @@ import math
 import torch
 
 import difftetvr as dtv
+from difftetvr.fitting import CameraRefinement
 from difftetvr.fitting.cameras.refined import rotation_of
 
 
@@ -75,7 +76,7 @@ def main() -> None:
     parser.add_argument("--shift", type=float, default=0.01)
     parser.add_argument("--views", type=int, default=0, help="training views to take, evenly spread; 0: all")
     parser.add_argument("--tested", type=int, default=0, help="held-out views to take; 0: all")
-    parser.add_argument("--rates", nargs="+", type=float, default=[5e-3])
+    parser.add_argument("--rates", nargs="+", type=float, default=[CameraRefinement().rate])
     parser.add_argument("--only-refined", action="store_true")
     options = parser.parse_args()
     capture = dtv.load_capture(options.capture, downscale=options.downscale)
@@ -83,9 +84,7 @@ def main() -> None:
     off = disturbed(capture, options.degrees, options.shift)
     plain = dtv.FitConfig(cells=options.cells, iterations=options.iterations, evaluate_every=0)
     refined = [
-        dataclasses.replace(
-            plain, refine_poses=True, cameras=dtv.fitting.CameraRefinement(rate=rate, final_rate=0.1 * rate)
-        )
+        dataclasses.replace(plain, refine_poses=True, cameras=CameraRefinement(rate=rate, final_rate=0.1 * rate))
         for rate in options.rates
     ]
     rows = [("true", capture, plain), ("off, as given", off, plain)] if not options.only_refined else []

@@ -71,6 +71,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cells", type=int, default=20_000)
     parser.add_argument("--iterations", type=int, default=2400)
+    parser.add_argument("--total-variation", type=float, default=ScalarConfig().total_variation)
     parser.add_argument("--report", type=Path, default=Path("out/scalars"))
     options = parser.parse_args()
     source = dtv.VolumeCapture()
@@ -87,6 +88,7 @@ def main() -> None:
             cells=options.cells,
             iterations=options.iterations - colors_first,
             colors_first=colors_first,
+            total_variation=options.total_variation,
             evaluate_every=0,
         )
         start = time.perf_counter()

@@ -78,6 +78,12 @@ def test_fit_transfer(run, tmp_path):
     assert (tmp_path / "fit_transfer.json").exists() and (tmp_path / "fit_transfer.png").stat().st_size > 10_000
 
 
+def test_fit_scalar(run, tmp_path):
+    output = run("fit_scalar", tmp_path)
+    assert last_number(output, r"PSNR ([\d.]+)") > 38.0
+    assert (tmp_path / "fit_scalar.vtu").exists() and (tmp_path / "fit_scalar.png").stat().st_size > 10_000
+
+
 def test_own_training_loop(run):
     output = run("own_training_loop")
     assert last_number(output, r"PSNR ([\d.]+)") > 22.0

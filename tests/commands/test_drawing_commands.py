@@ -132,6 +132,10 @@ def test_a_path_from_a_file(simulation, tmp_path, capsys):
         (["-o", "a.png", "--light", 0, 0, 1], "--light is the direction to the light of --shade"),
         (["-o", "a.png", "--shape", 3, 3, 3], "is a mesh, of which --shape says nothing"),
         (["-o", "a.png", "--save-transfer-function", "a.xml"], "written as .json"),
+        (["-o", "a.png", "--unit", "mm"], "--unit mm is what --axes are told in"),
+        (["-o", "a.webp", "--path", "a.json", "--view", 3], "--path a.json says where the camera is; leave out --view"),
+        (["-o", "a.png", "--show", "cell-quality", "--axes"], "--axes is for the image"),
+        (["-o", "a.png", "--show", "cell-quality", "--log"], "--log is for the image"),
     ],
 )
 def test_options_that_make_no_sense(simulation, tmp_path, capsys, monkeypatch, options, said):
@@ -140,6 +144,25 @@ def test_options_that_make_no_sense(simulation, tmp_path, capsys, monkeypatch, o
     before = sorted(tmp_path.iterdir())
     assert said in fails(capsys, "render", simulation, *options)
     assert sorted(tmp_path.iterdir()) == before
+
+
+def test_looks_of_scalars_are_refused_for_what_has_its_own_colours(photo_run, tmp_path, capsys):
+    for option in (["--log"], ["--colormap", "gray"], ["--percentile", 1, 99], ["--value-range", 0, 1]):
+        for command in ("render", "cut"):
+            message = fails(capsys, command, photo_run, "-o", tmp_path / "a.png", *option)
+            assert f"{option[0]} is for scalars, but {photo_run} has color and density" in message
+    draw("render", photo_run, "-o", tmp_path / "a.png", *SMALL[:2], "--scalar", "density", "--log")
+
+
+def test_what_has_no_logarithm_is_transparent(tmp_path):
+    mesh = dtv.TetMesh.grid((10, 10, 10))
+    x = mesh.vertices[:, 0].numpy()
+    names = {"vertices": mesh.vertices.numpy(), "tets": mesh.tets.numpy()}
+    for name, scalar in (("zero", np.maximum(x - 0.5, 0.0)), ("negative", x - 0.5)):
+        np.savez(tmp_path / f"{name}.npz", **names, q=scalar)
+        given = ["--eye", 0.5, -3, 0.5, "--target", 0.5, 0.5, 0.5, "--opacity", "flat", "--log", "--transparent"]
+        alpha = draw("render", tmp_path / f"{name}.npz", "-o", tmp_path / "a.png", *given, *SMALL)[9:11, :, 3]
+        assert not alpha[:, :12].any() and alpha[:, 13].min() > 60
 
 
 def test_a_saved_transfer_function_makes_the_same_picture(simulation, tmp_path, capsys):
@@ -211,8 +234,15 @@ def test_a_volume_is_drawn_as_it_is(tmp_path, capsys):
     values = np.random.default_rng(0).random((5, 6, 7)).astype(np.float32)
     np.save(tmp_path / "scan.npy", values)
     look = ["--colormap", "gray", "--opacity", "flat", "--colorbar"]
+    capsys.readouterr()
     assert draw("render", tmp_path / "scan.npy", "-o", tmp_path / "b.png", *SMALL, *look).max() > 60
-    for option in (["--clip", 1, 0, 0, 0], ["--scalar", "x"], ["--shade"]):
+    assert "stand for 0 to 1" not in capsys.readouterr().out, "the bar tells the range, which is another one"
+    # What is said of its looks stands in for the transfer function that the tooth brings along.
+    asked = ["--colormap", "gray", *SMALL]
+    gray = draw("render", "tooth", "-o", tmp_path / "a.png", *asked)
+    assert np.ptp(gray, axis=2).max() <= 1 and gray.max() > 60
+    assert np.ptp(shown, axis=2).max() > 60
+    for option in (["--clip", 1, 0, 0, 0], ["--scalar", "x"], ["--shade"], ["--renderer", "marching"]):
         message = fails(capsys, "render", "tooth", "-o", tmp_path / "c.png", *option)
         assert f"tooth is a volume, and {option[0]} is for meshes" in message
 

@@ -11,6 +11,8 @@ from torch import Tensor
 import difftetvr as dtv
 from difftetvr.inverse import ScalarConfig, fit_scalar
 from difftetvr.inverse.scalars.beginning import matching, ranked
+from difftetvr.inverse.scalars.reconstruction import ScalarReconstruction
+from difftetvr.inverse.variation import total_variation
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.rendering import ScalarField
 
@@ -68,6 +70,26 @@ def test_a_constant_start_and_a_fixed_mesh_will_do(scene) -> None:
     options = SMALL | {"colors_first": 0, "move": False, "refine": "none", "rate": 0.03}
     result = fit_scalar(capture, RAMP, ScalarConfig.from_json(options))
     assert result.evaluation.mean_psnr > 24.0
+
+
+def test_total_variation_makes_scalars_flatter_and_is_part_of_the_loss(scene) -> None:
+    *_, capture = scene
+    still = SMALL | {"iterations": 40, "colors_first": 0, "move": False, "refine": "none"}
+    results = [fit_scalar(capture, RAMP, ScalarConfig.from_json(still | {"total_variation": w})) for w in (0.0, 3e-3)]
+    rough, flat = (float(total_variation(result.mesh, result.field.scalar).value) for result in results)
+    assert flat < 0.95 * rough
+    mesh, values = TetMesh.grid((4, 4, 4), *capture.bounds.tolist()), torch.rand(125)
+    runs = [
+        ScalarReconstruction(
+            capture, RAMP, ScalarConfig(total_variation=w, refine="none"), ATTENUATION, mesh, values.clone()
+        )
+        for w in (0.0, 3e-3)
+    ]
+    for run in runs:
+        run.step()
+    # The box's side is 1.
+    variation = float(total_variation(mesh, values).value)
+    assert runs[1].history.loss[0] - runs[0].history.loss[0] == pytest.approx(3e-3 * variation, rel=0.02)
 
 
 def test_an_unknown_function_is_found_along_with_the_scalars(scene) -> None:

@@ -21,7 +21,7 @@ from difftetvr.inverse.tomography.likelihoods import LIKELIHOODS
 from difftetvr.inverse.tomography.measurements import Measurements, as_camera, steps_for
 from difftetvr.inverse.tomography.objective import Objective
 from difftetvr.inverse.tomography.solver import solve
-from difftetvr.inverse.tomography.variation import cell_weights, total_variation, weighted_square
+from difftetvr.inverse.variation import cell_weights, total_variation, weighted_square
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.rendering import render
 

@@ -257,6 +257,16 @@ def test_what_is_refused():
         model_image(mesh, field, camera_at(OUTSIDE, size=30), truth)
 
 
+def test_views_of_no_rays_are_refused():
+    mesh = TetMesh.grid((1, 1, 1))
+    density, steps = torch.ones(mesh.num_vertices), torch.zeros(mesh.topology.faces.shape[0])
+    rays = dtv.Rays(torch.zeros(0, 3, 3), torch.ones(0, 3, 3))
+    with pytest.raises(DiffTetError, match="says nothing"):
+        model_image(mesh, Field(torch.ones(mesh.num_vertices, 3), density), rays, torch.zeros(0, 3, 3))
+    with pytest.raises(DiffTetError, match="says nothing"):
+        model_line_integrals(mesh, density, rays, (torch.zeros(0, 3), torch.zeros(0, 3)), steps)
+
+
 @pytest.mark.parametrize("scale", [1.0, 1e4])
 def test_models_of_line_integrals_predict_what_densities_do(scale):
     """Of vertices exactly where rays meet their cells but once; of edges and flips as bent hats are integrated."""

@@ -10,53 +10,15 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracle.oracle import render_oracle
+from rendering.bundles import INSIDE, OUTSIDE, assert_same, flat, random_rays, scene
 from torch import Tensor
 
 import difftetvr as dtv
 from difftetvr.errors import CameraError, DiffTetError
 from difftetvr.mesh import Field, TetMesh
-from difftetvr.rendering import Camera, Rays, RenderedImage, ScalarField, render
+from difftetvr.rendering import Camera, Rays, ScalarField, render
 
 TRACERS = ("marching", "linked-list")
-
-
-def exact(camera: Camera) -> Camera:
-    """The same view with a rotation that is one in float64."""
-    pose = camera.world_to_camera.double()
-    left, _, right = torch.linalg.svd(pose[:3, :3])
-    pose[:3, :3] = left @ right
-    return camera.with_pose(pose)
-
-
-OUTSIDE = exact(Camera.look_at((2.0, 1.7, 1.4), (0.5, 0.5, 0.5), width=23, height=19))
-INSIDE = exact(Camera.look_at((0.6, 0.55, 0.4), (0.5, 0.9, 0.5), fov_y=1.4, width=23, height=19))
-
-
-def scene(dtype: torch.dtype = torch.float64, channels: int = 3, size: int = 4) -> tuple[TetMesh, Field]:
-    generator = torch.Generator().manual_seed(5)
-    mesh = TetMesh.grid((size, size, size), dtype=dtype)
-    noise = torch.rand(mesh.num_vertices, 3, generator=generator, dtype=dtype)
-    mesh = mesh.with_vertices(mesh.vertices + 0.2 / size * (noise - 0.5))
-    color, density = (torch.rand(mesh.num_vertices, count, generator=generator, dtype=dtype) for count in (channels, 1))
-    return mesh, Field(color, 4.0 * density[:, 0])
-
-
-def random_rays(count: int, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
-    """Origins, half of them inside the unit cube, and directions towards points inside it."""
-    generator = torch.Generator().manual_seed(count)
-    origins, targets = (torch.rand(count, 3, generator=generator, dtype=torch.float64) for _ in range(2))
-    origins[: count // 2] = 4.0 * origins[: count // 2] - 1.5
-    return origins.to(dtype), (targets - origins).to(dtype)
-
-
-def flat(image: RenderedImage | Any) -> Tensor:
-    parts = (image.color, image.alpha, image.depth, image.optical_depth)
-    return torch.cat([part.reshape(-1) for part in parts])
-
-
-def assert_same(one: RenderedImage, other: RenderedImage, tolerance: float) -> None:
-    assert one.color.shape == other.color.shape
-    assert float((flat(one) - flat(other)).abs().max()) < tolerance
 
 
 def single_ray_camera(origin: Tensor, direction: Tensor) -> Camera:
@@ -95,51 +57,6 @@ def test_scalars_and_thresholds(renderer: str) -> None:
         assert_same(render(mesh, scalars, camera.rays(), **options), render(mesh, scalars, camera, **options), 2e-6)
 
 
-def test_colours_that_depend_on_the_direction() -> None:
-    mesh, field = scene()
-    harmonics = torch.randn(mesh.num_vertices, 8, 3, dtype=torch.float64)
-    seen = Field(field.color, field.density, harmonics=harmonics)
-    assert_same(render(mesh, seen, OUTSIDE.rays()), render(mesh, seen, OUTSIDE), 2e-6)
-    both = render(mesh, seen, [OUTSIDE, INSIDE])
-    assert isinstance(both, RenderedImage)
-    assert_same(both[1], render(mesh, seen, INSIDE), 2e-6)
-    with pytest.raises(DiffTetError, match="start at 1,025 points"):
-        render(mesh, seen, Rays(*random_rays(1025)))
-    with pytest.raises(DiffTetError, match="start at one point"):
-        dtv.rendering.gauss_newton.model_image(mesh, seen, Rays(*random_rays(8)), torch.ones(8, 3), torch.ones(8, 3))
-
-
-def test_rays_of_several_cameras_mixed_see_what_each_camera_sees() -> None:
-    """Also where harmonics give each point of view its own colours; with their derivatives."""
-    mesh, field = scene()
-    harmonics = torch.randn(mesh.num_vertices, 8, 3, dtype=torch.float64).requires_grad_()
-    seen = Field(field.color, field.density, harmonics=harmonics)
-    views = [OUTSIDE, INSIDE, Camera.look_at((-2.0, 0.3, 1.2), (0.5, 0.5, 0.5), width=9, height=8)]
-    both = Rays.joined([camera.rays() for camera in views])
-    shuffle = torch.randperm(both.shape[0])[: both.shape[0] // 4 * 4].reshape(-1, 4)
-    mixed = Rays(both.origins[shuffle], both.directions[shuffle])
-    expected = torch.cat([render(mesh, seen, camera.rays()).color.reshape(-1, 3) for camera in views])[shuffle]
-    found = render(mesh, seen, mixed).color
-    assert found.shape == (*shuffle.shape, 3)
-    torch.testing.assert_close(found, expected, rtol=0.0, atol=1e-9)
-    weight = torch.randn_like(found)
-    (one,) = torch.autograd.grad((found * weight).sum(), harmonics)
-    (other,) = torch.autograd.grad((expected * weight).sum(), harmonics)
-    torch.testing.assert_close(one, other, rtol=0.0, atol=1e-9)
-
-
-def test_parallel_rays_see_colours_of_their_direction() -> None:
-    """As a pinhole camera does from very far away."""
-    mesh, field = scene()
-    harmonics = torch.randn(mesh.num_vertices, 8, 3, dtype=torch.float64)
-    seen = Field(field.color, field.density, harmonics=harmonics)
-    camera = dtv.ParallelCamera.look_at((3.0, 2.0, 1.5), (0.5, 0.5, 0.5), extent=1.5, width=9, height=7)
-    rays, away = camera.rays(), 1e7
-    eye = rays.origins.mean((0, 1)) - away * rays.directions[0, 0]
-    far = Rays(eye, rays.origins + rays.directions - eye)
-    torch.testing.assert_close(render(mesh, seen, camera).color, render(mesh, seen, far).color, rtol=0.0, atol=1e-4)
-
-
 def test_rays_know_whether_they_start_at_one_point() -> None:
     """Of all sources with one, without a look at values, which would have to come from the device."""
     pose = OUTSIDE.world_to_camera
@@ -155,24 +72,6 @@ def test_rays_know_whether_they_start_at_one_point() -> None:
     assert parallel.rays().eye is None and Rays(torch.zeros(0, 3), [0.0, 0.0, 1.0]).eye is None
     # Equal ones that are several, too, are found to be equal where that is needed.
     assert Rays(torch.ones(4, 3), torch.rand(4, 3) + 0.1).eye is None
-
-
-def test_a_lens_sees_colours_that_depend_on_the_direction() -> None:
-    mesh, field = scene()
-    harmonics = torch.randn(mesh.num_vertices, 8, 3, dtype=torch.float64)
-    seen = Field(field.color, field.density, harmonics=harmonics)
-    pose = INSIDE.world_to_camera.clone().requires_grad_()
-    lens = dtv.LensCamera(pose, 15.0, 15.0, 11.5, 9.5, 23, 19, coefficients=[-0.2, 0.05])
-    expected = render(mesh, seen.seen_from(mesh, INSIDE.position), lens)
-    assert torch.allclose(render(mesh, seen, lens).color, expected.color, rtol=0.0, atol=1e-9)
-    shift = torch.tensor([4.2e5, 5.4e6, 300.0], dtype=torch.float64)
-    far = TetMesh(mesh.vertices + shift, mesh.tets).to(dtype=torch.float32)
-    moved = pose.detach().clone()
-    moved[:3, 3] -= moved[:3, :3] @ shift
-    image = render(far, seen.to(dtype=torch.float32), lens.with_pose(moved))
-    assert float((image.color - expected.color.detach()).abs().max()) < 5e-5
-    (gradient,) = torch.autograd.grad(render(mesh, seen, lens).color.sum(), pose)
-    assert float(gradient[:3].abs().max()) > 0.0
 
 
 @pytest.mark.parametrize("offset", [(0.0, 0.0, 0.0), (4.2e5, 5.4e6, 300.0)])
@@ -307,6 +206,19 @@ def in_a_plane(origins: Tensor, directions: Tensor) -> Tensor:
     flat = directions.abs() < 1e-6
     on_grid = (6.0 * origins - torch.round(6.0 * origins)).abs() < 1e-5
     return (flat & on_grid).any(1)
+
+
+@pytest.mark.parametrize("renderer", ["marching", "linked-list"])
+def test_no_ray_is_lost_in_float64_where_float32_was_first(renderer: str) -> None:
+    """Meshes of both precisions share a topology, and what is kept with it; rays pass a billionth from the sides."""
+    grid = TetMesh.grid((3, 3, 3), dtype=torch.float64)
+    mesh = grid.with_vertices((grid.vertices + 1.0) / 3.0)
+    field = Field(torch.ones(mesh.num_vertices, 3).double(), torch.ones(mesh.num_vertices).double())
+    render(mesh.to(dtype=torch.float32), field.to(dtype=torch.float32), Rays(*random_rays(4)), renderer=renderer)
+    low, high = (1.0 + 1e-9) / 3.0, (2.0 - 1e-9) / 3.0
+    origins = torch.tensor([[x, y, -1.0] for x in (low, 0.4, high) for y in (low, 0.6, high)], dtype=torch.float64)
+    seen = render(mesh, field, Rays(origins, torch.tensor([0.0, 0.0, 1.0]).double()), renderer=renderer)
+    torch.testing.assert_close(seen.optical_depth, torch.full((9,), 1.0 / 3.0).double())
 
 
 @given(seed=st.integers(0, 2**31), cut=st.floats(0.0, 3.0))

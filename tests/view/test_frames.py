@@ -1,5 +1,6 @@
 """Pictures with what is around a volume, and films of them."""
 
+import itertools
 import sys
 
 import numpy as np
@@ -10,7 +11,9 @@ from PIL import Image
 import difftetvr as dtv
 from difftetvr.errors import CaptureError
 from difftetvr.view.frames import AxesBox, ColorScale, FrameStyle, framed, save_film
-from difftetvr.view.frames.color_bar import beside_color_bar
+from difftetvr.view.frames.axes import ProjectedBox
+from difftetvr.view.frames.color_bar import beside_color_bar, draw_color_bar
+from difftetvr.view.frames.lettering import Ink, Layer
 
 CAMERA = dtv.Camera.look_at((2.0, -3.0, 2.0), (0.5, 0.5, 0.5), width=200, height=160)
 BOX = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
@@ -74,9 +77,41 @@ def test_a_colour_bar_has_the_colours_of_its_function_and_numbers_in_its_range()
 def test_a_logarithmic_bar():
     scale = ColorScale("p", (1.0, 1000.0), FUNCTION, is_log=True)
     places = {label: place for place, label in scale.ticks()}
-    assert places["$10^{1}$"] == pytest.approx(1 / 3) and places["$10^{2}$"] == pytest.approx(2 / 3)
+    assert places["10¹"] == pytest.approx(1 / 3) and places["10²"] == pytest.approx(2 / 3)
     assert float(scale.colors(4)[1, 0]) == pytest.approx(9 / 999)
     assert all(0 <= place <= 1 for place, _ in ColorScale("p", (2.0, 5.0), FUNCTION, is_log=True).ticks())
+
+
+def test_words_stand_apart_within_the_picture(recwarn):
+    """However flat the box, however long the numbers and the name of the scalar, and whatever that is."""
+    for size, bounds, ends, is_log, label in (
+        (512, BOX * torch.tensor([4.0, 4.0, 1.0]) - 2.0, (0.5, 1.2), False, "p"),
+        (256, BOX + 1e5, (1e60, 1e300), True, "$x_{$ \\foo"),
+        (200, 1e30 * BOX.double(), (1e-3, 1e-1), True, "a name that goes on and on " * 9),
+    ):
+        middle = bounds.double().mean(0)
+        eye = middle + 3.0 * float(bounds[1, 0] - bounds[0, 0]) * torch.tensor([0.5, -0.8, 0.5], dtype=torch.float64)
+        box = AxesBox(bounds, unit="mm")
+        layer = Layer(size, size, Ink("white", "black"))
+        draw_color_bar(layer, ColorScale(label, ends, FUNCTION, is_log))
+        ProjectedBox(box, dtv.Camera.look_at(eye, middle, width=size, height=size)).draw_numbers(layer)
+        words = layer.words
+        assert sum("(mm)" in text for text, _ in words) == 3
+        boxes = [box for _, box in words]
+        assert all(min(box.left, box.top, size - box.right, size - box.bottom) >= 0.0 for box in boxes)
+        assert not any(one.meets(other, 0.0) for one, other in itertools.combinations(boxes, 2))
+    assert not recwarn.list
+
+
+def test_small_letters_are_whole():
+    """Matplotlib moves straight lines to pixels, and so leaves bars of letters out."""
+    for part in range(8):
+        layer = Layer(40, 20, Ink("white", "black"))
+        layer.text((20.0, 10.0 + part / 8), "E")
+        drawn = np.asarray(layer.drawn()).astype(int)
+        bright = drawn[..., 0] * drawn[..., 3] // 255
+        lit = bright[:, np.flatnonzero((bright > 100).any(0))[-2]] > 60
+        assert np.count_nonzero(lit[1:] & ~lit[:-1]) == 3, "an E has three bars"
 
 
 def test_a_bar_beside_a_picture_leaves_it_as_it_is():
@@ -123,12 +158,71 @@ def test_what_is_interrupted_leaves_nothing(tmp_path, name):
         assert list(tmp_path.iterdir()) == []
 
 
-def test_videos(tmp_path):
+@pytest.mark.parametrize("name", ["film.mp4", "film.webm"])
+def test_videos(tmp_path, name, capfd):
     reader = pytest.importorskip("imageio_ffmpeg")
-    assert save_film(tmp_path / "film.mp4", frames(5), 10.0) == 5
-    film = reader.read_frames(str(tmp_path / "film.mp4"))
+    assert save_film(tmp_path / name, frames(5), 10.0) == 5
+    film = reader.read_frames(str(tmp_path / name))
     about = next(film)
-    assert about["size"] == (30, 22) and about["fps"] == 10.0 and len(list(film)) == 5
+    assert about["size"] == (30, 22) and about["fps"] == 10.0
+    shown = [np.frombuffer(frame, np.uint8).reshape(22, 30, 3) for frame in film]
+    assert [frame[11, 15, 0] for frame in shown] == pytest.approx([0, 40, 80, 120, 160], abs=6)
+    # Players of large videos take another red than those of small ones, where none is named.
+    assert "bt709" in about["pix_fmt"]
+    assert capfd.readouterr() == ("", ""), "the encoder is silent"
+
+
+def test_films_of_a_kind_that_cannot_look_so(tmp_path):
+    pytest.importorskip("imageio_ffmpeg")
+    clear, point = Image.new("RGBA", (20, 20)), Image.new("RGB", (1, 20))
+    for name, frame, fps, said in (
+        ("film.mp4", clear, 10, "A .mp4 knows no shades of transparency"),
+        ("film.gif", clear, 10, "A .gif knows no shades of transparency"),
+        ("film.webm", point, 10, "1 x 20 pixels is too small"),
+        ("film.gif", point, 60, "at most 50 frames a second"),
+    ):
+        with pytest.raises(CaptureError, match=said):
+            save_film(tmp_path / name, [frame], fps)
+    assert list(tmp_path.iterdir()) == []
+    assert save_film(tmp_path / "film.webp", [clear], 10) == 1
+
+
+def test_animations_take_as_long_as_they_should(tmp_path):
+    for name, fps in (("film.gif", 30.0), ("film.webp", 24.0)):
+        save_film(tmp_path / name, frames(6), fps)
+        film, took = Image.open(tmp_path / name), []
+        for index in range(film.n_frames):
+            film.seek(index)
+            film.load()
+            took.append(film.info["duration"])
+        assert sum(took) == pytest.approx(1000 * 6 / fps, abs=0.1)
+
+
+@pytest.mark.parametrize("stop", [0, 2])
+def test_a_video_that_its_encoder_could_not_finish_is_none(tmp_path, monkeypatch, stop):
+    """As on a full disk, of which the encoder may learn while it closes the file."""
+    reader = pytest.importorskip("imageio_ffmpeg")
+    write = reader.write_frames
+
+    def failing(path, *args, **options):
+        encoder = write(path, *args, **options)
+        yield encoder.send(None)
+        count = 0
+        try:
+            while True:
+                encoder.send((yield))
+                count += 1
+                if count == stop:
+                    raise OSError("FFMPEG COMMAND:\nand more")
+        finally:
+            encoder.close()
+            with open(path, "r+b") as file:
+                file.truncate(100)
+
+    monkeypatch.setattr(reader, "write_frames", failing)
+    with pytest.raises(CaptureError, match=r"^Cannot write [^\n]*film\.mp4: the encoder [^\n]*$"):
+        save_film(tmp_path / "film.mp4", frames(4), 10.0)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_missing_package_is_named(tmp_path, monkeypatch):

@@ -254,13 +254,15 @@ class VolumeOptions:
             value_range: Values that stand for 0 and 1 of it; of volumes without one all values are kept.
             console: Where to say what was found.
         """
-        from difftetvr.capture import TOOTH, Volume, VolumeCapture
+        from difftetvr.capture import TOOTH, CaptureWarning, Volume, VolumeCapture
 
         given = None if transfer_function is None else str(transfer_function)
         with saying(console), waiting(console, f"Reading {name}"):
             if given is not None or name == TOOTH:
                 source = VolumeCapture(name, self.shape, self.dtype, self.spacing, given, value_range=value_range)
                 return source.load_volume()
+            # Their range is that of a transfer function which is yet to be chosen.
+            warnings.filterwarnings("ignore", r".* stand for 0 to 1 of the transfer function", CaptureWarning)
             return Volume.load(name, self.shape, self.dtype, self.spacing), None
 
 

@@ -132,8 +132,26 @@ class Render:
             color_of(self.background)
             if self.paper.transparent:
                 raise CaptureError("--transparent leaves no background; leave out --background, or --transparent.")
+        if self.paper.unit is not None and not self.paper.axes:
+            raise CaptureError(f"--unit {self.paper.unit} is what --axes are told in; give both.")
+        if self.show != "image":
+            self._require_statistics()
         if self.light is not None and not (self.shade and any(self.light)):
             raise CaptureError("--light is the direction to the light of --shade, and not 0 0 0; give both.")
+
+    def _require_statistics(self) -> None:
+        """Refuse options of an image for what is none."""
+        given = {
+            "transparent": self.paper.transparent,
+            "colorbar": self.paper.colorbar,
+            "axes": self.paper.axes,
+            "background": self.background is not None,
+            "shade": self.shade,
+            "save-transfer-function": self.save_transfer_function is not None,
+        } | dict.fromkeys(self.scalars.given(), True)
+        for name, is_given in given.items():
+            if is_given:
+                raise CaptureError(f"--{name} is for the image; leave it out, or --show {self.show}.")
 
     def _mesh_subject(self, data: MeshData, device: torch.device, console: Console) -> MeshSubject:
         from difftetvr.cli.drawing.subjects import Drawing, MeshSubject, renderer_for
@@ -150,7 +168,12 @@ class Render:
     def _volume_subject(self, device: torch.device, console: Console) -> VolumeSubject:
         from difftetvr.cli.drawing.subjects import VolumeSubject
 
-        for name, value in (("clip", self.clip), ("shade", self.shade), ("scalar", self.scalars.scalar)):
+        for name, value in (
+            ("clip", self.clip),
+            ("shade", self.shade),
+            ("scalar", self.scalars.scalar),
+            ("renderer", self.renderer),
+        ):
             if value:
                 raise CaptureError(f"{self.model} is a volume, and --{name} is for meshes; leave it out.")
         if self.show != "image":
@@ -208,15 +231,17 @@ class Render:
     ) -> None:
         from difftetvr.terminal import waiting
         from difftetvr.view.frames import framed, save_film
+        from difftetvr.view.frames.films import require_shown
 
         assert shots.fps is not None
+        camera, count = shots.cameras[0], counted(len(shots.cameras), "frame")
+        require_shown(self.output, (camera.width, camera.height), shots.fps, style.background is None)
 
         def frames() -> Iterator[Image]:
             for camera in shots.cameras:
                 image = subject.seen_by(camera)
                 yield framed(image.color, image.alpha, camera, style)
 
-        camera, count = shots.cameras[0], counted(len(shots.cameras), "frame")
         with waiting(console, f"Rendering {count}"):
             save_film(self.output, frames(), shots.fps)
         what = f"{count} of {camera.width} x {camera.height}, {shots.fps:g} a second"

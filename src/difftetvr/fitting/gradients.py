@@ -11,7 +11,7 @@ import torch
 from difftetvr.capture.truth import Color, Truth
 from difftetvr.fitting.cameras.refined import RefinedCameras
 from difftetvr.fitting.config import FitConfig
-from difftetvr.fitting.losses import LOSSES, sparsity
+from difftetvr.fitting.losses import LOSSES, WEIGHTS, sparsity
 from difftetvr.fitting.parameters import FieldParameters
 from difftetvr.fitting.processes import Processes
 from difftetvr.mesh.tetmesh import TetMesh
@@ -53,11 +53,15 @@ class ViewGradients:
         before = mesh.vertices.grad  # of earlier iterations, in which all processes have a part already
         for leaf in leaves:
             leaf.grad = None
+        if self.cameras is not None:
+            self.cameras.curvature.zero_()
         weight = 1.0 / len(views)
         own = [self._accumulate(mesh, view, iteration, weight) for view in self.processes.share(views)]
         gradients = [torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for leaf in leaves]
         for leaf, gradient in zip(leaves, self.processes.sum(gradients), strict=True):
             leaf.grad = gradient
+        if self.cameras is not None:
+            self.cameras.curvature = self.processes.sum(self.cameras.curvature)
         if before is not None and mesh.vertices.grad is not None:
             mesh.vertices.grad = before + mesh.vertices.grad
         return [reduce(add, values) / len(views) for values in zip(*self._of_all(own, len(views)), strict=True)]
@@ -83,14 +87,18 @@ class ViewGradients:
         """Adds a view's gradient; returns its loss and mean squared error."""
         background: Color = self.config.background_at(iteration)
         truth = self.truth.image(view, background).to(mesh.vertices.device)
-        image = render(
+        seen = render(
             mesh,
             self.parameters.field(self.config.bands_at(iteration)),
             self.truth.camera(view) if self.cameras is None else self.cameras.camera(view),
             background=torch.tensor(background),
             deterministic=self.config.deterministic,
-        ).color
-        image, share = self.truth.where_valid(view, image, truth), self.truth.counted_share(view)
+        )
+        image, share = self.truth.where_valid(view, seen.color, truth), self.truth.counted_share(view)
+        if self.cameras is not None:
+            weights = WEIGHTS[self.config.loss](image.detach() - truth) * (weight / (truth.numel() * share))
+            weights = self.truth.where_valid(view, weights, torch.zeros_like(weights))
+            self.cameras.note_curvature(view, seen, weights)
         loss = LOSSES[self.config.loss](image, truth) / share
         if self.config.sparsity:
             loss = loss + self.config.sparsity * sparsity(self.parameters.density)

@@ -10,7 +10,11 @@ from difftetvr.fitting.metrics import mean_similarity
 
 _SSIM_PART = 0.2
 
+_SMALL = 0.02  # residuals below which absolute ones count as this large to divide by
+
 Loss = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
+
+Residuals = Callable[[torch.Tensor], torch.Tensor]
 
 
 def l1(image: torch.Tensor, reference: torch.Tensor) -> torch.Tensor:
@@ -37,4 +41,15 @@ def sparsity(density: torch.Tensor) -> torch.Tensor:
     return torch.log1p(2.0 * density.square()).mean()
 
 
+def _of_squares(residual: torch.Tensor) -> torch.Tensor:
+    return torch.ones_like(residual)
+
+
+def _of_absolutes(residual: torch.Tensor) -> torch.Tensor:
+    return 0.5 / residual.abs().clamp(min=_SMALL)
+
+
 LOSSES: dict[str, Loss] = {"l1": l1, "l2": l2, "l1-ssim": l1_ssim}
+
+WEIGHTS: dict[str, Residuals] = {"l1": _of_absolutes, "l2": _of_squares, "l1-ssim": _of_absolutes}
+"""From residuals to weights of their squares that make a sum of squares as steep as the loss, times their number."""

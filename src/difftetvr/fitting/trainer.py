@@ -12,7 +12,7 @@ from difftetvr.errors import DiffTetError
 from difftetvr.fitting.beginning.initial_mesh import Start, load_start
 from difftetvr.fitting.beginning.requirements import device_for, require_fittable
 from difftetvr.fitting.beginning.starting_mesh import starting_mesh
-from difftetvr.fitting.cameras.alignment import align_held_out
+from difftetvr.fitting.cameras.alignment import StillWorld, align_held_out
 from difftetvr.fitting.cameras.refined import RefinedCameras
 from difftetvr.fitting.config import FitConfig
 from difftetvr.fitting.gradients import ViewGradients
@@ -167,12 +167,9 @@ class Trainer(AdaptiveRun):
         """Moves held-out cameras to where their images fit best, where cameras are refined."""
         if self.cameras is None or not self.config.refine_poses:
             return
-        field, options = self.field(), self.config.cameras
         background = self.config.evaluation_background()
-        align_held_out(
-            *(self.cameras, options, self.mesh, field, self._truth, views, background),
-            *(self.processes, self.config.deterministic),
-        )
+        world = StillWorld(self.mesh, self.field(), self._truth, background, self.config.deterministic)
+        align_held_out(self.cameras, self.config.cameras, world, views, self.processes)
 
     def require_agreement(self) -> None:
         """Checks that all processes have come to the same state.

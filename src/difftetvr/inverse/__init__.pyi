@@ -1,6 +1,7 @@
 from . import scalars as scalars
 from . import tomography as tomography
 from . import transfer as transfer
+from . import variation as variation
 from . import viewpoint as viewpoint
 from .scalars.config import ScalarConfig as ScalarConfig
 from .scalars.loop import ScalarResult as ScalarResult

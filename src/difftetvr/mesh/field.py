@@ -136,7 +136,7 @@ class Field:
 
         Args:
             mesh: The mesh the field belongs to.
-            eye: (3,) position of the camera; differentiable, as are the mesh's vertices.
+            eye: (3,) position of the camera, or (N, 3) one for each value; differentiable, as are the mesh's vertices.
 
         Returns:
             A field without harmonics; this one if it has none.
@@ -152,14 +152,14 @@ class Field:
         """The colours that parallel rays see, such as those of an orthographic camera.
 
         Args:
-            direction: (3,) where the rays go, of any length but 0; differentiable.
+            direction: (3,) where the rays go, of any length but 0, or (N, 3) likewise; differentiable.
 
         Returns:
             A field without harmonics; this one if it has none.
         """
         if self.harmonics is None:
             return self
-        return self._seen_along(torch.nn.functional.normalize(direction[None].to(self.color.device), dim=1))
+        return self._seen_along(torch.nn.functional.normalize(direction.reshape(-1, 3).to(self.color.device), dim=1))
 
     def _seen_along(self, directions: torch.Tensor) -> Field:
         """The colours along (N, 3) unit vectors, or (1, 3) for all."""

@@ -14,6 +14,7 @@ from . import scalar_field as scalar_field
 from . import search as search
 from . import tracers as tracers
 from . import traversal as traversal
+from . import viewpoints as viewpoints
 from .api import RenderedImage as RenderedImage
 from .api import render as render
 from .cameras.camera_file import load_camera as load_camera

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, overload
 
 import torch
@@ -20,6 +20,7 @@ from difftetvr.rendering.cell_features import CellFeatures
 from difftetvr.rendering.preparation import ViewOptions, as_rays, is_plain, prepare_view
 from difftetvr.rendering.rays import Rays, RaySource
 from difftetvr.rendering.scalar_field import ScalarField
+from difftetvr.rendering.viewpoints import Viewpoint
 
 _HALF, _OPAQUE = math.log(2.0), 1e3
 """Optical depths of opacity 1/2, and at which the transmittance is 0 in every precision."""
@@ -121,9 +122,7 @@ def render(
         field: Channels and density per vertex (linear inside each cell) or per cell (constant); or scalars likewise,
             with a transfer function; or channels per cell over the density of either (`CellFeatures`).
         camera: A camera, inside or outside of the mesh; any bundle of rays; or cameras, which are rendered together. A
-            field with harmonics is rendered once for each point where rays start, or direction if those are fewer;
-            what its colours depend on that point by is then shared by all rays that start there, so that derivatives
-            are those by a camera's place, and not by the origins of single rays.
+            field with harmonics is rendered once for each point where rays start, or direction if those are fewer.
         background: (C,) channels behind the volume, linear RGB for colours; 0 if None.
         renderer: How crossings are found and ordered. ``"marching"`` walks from cell to cell; ``"linked-list"`` sorts
             the crossings of each pixel; ``"projected"`` sorts the cells once for the whole view of a pinhole camera,
@@ -227,18 +226,26 @@ def _render(
     options: ViewOptions,
     clip_plane: Sequence[float] | torch.Tensor | None,
 ) -> RenderedImage:
-    view = prepare_view(mesh, field, camera, options)
+    view = prepare_view(mesh, field, camera, options, clip_plane)
     behind = as_background(background, mesh.vertices, view.task.channels)
-    limits = view.limits(clip_plane)
     if 0 in view.shape:
         empty = view.empty(view.shape)
         return RenderedImage(empty[..., None].expand(*view.shape, view.task.channels), empty, empty, empty)
     with view.task.backend.exclusive():
-        shot = view.shot(limits)
-    pixels = RenderFunction.apply(view.task, shot, view.vertices, view.pose, behind, limits, view.lines, *view.parts)
+        shot = view.shot()
+    tensors = view.vertices, view.pose, behind, view.limits, view.lines, *view.parts
+    pixels = RenderFunction.apply(view.task, shot, *tensors)
     if view.task.backend.dtype != mesh.vertices.dtype:
         pixels = tuple(part.to(mesh.vertices.dtype) for part in pixels)
-    return RenderedImage(*pixels).reshaped(*view.shape)
+    image = RenderedImage(*pixels)
+    if isinstance(camera, Rays) and isinstance(field, Field) and field.harmonics is not None:
+
+        def image_of(other: Field) -> torch.Tensor:
+            return _render(mesh, other, camera, None, options, clip_plane).color.reshape(-1, len(other.color[0]))
+
+        seen = Viewpoint.of(mesh, camera).with_derivatives_of_rays(image.color, mesh, field, image_of)
+        image = replace(image, color=seen)
+    return image.reshaped(*view.shape)
 
 
 def as_background(background: Any, like: torch.Tensor, channels: int = 3) -> torch.Tensor | None:

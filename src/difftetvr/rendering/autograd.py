@@ -10,9 +10,9 @@ from torch.autograd.function import once_differentiable
 
 from difftetvr.memory import tried_twice
 from difftetvr.recording import few_lengths, replayed
-from difftetvr.rendering.flags import flags_here, with_flags
 from difftetvr.rendering.kernels.adjoint import ImageAdjoint, render_adjoint
 from difftetvr.rendering.kernels.composition import Composition, Pixels
+from difftetvr.rendering.kernels.flags import flags_here, with_flags
 from difftetvr.rendering.kernels.forward import render_forward
 from difftetvr.rendering.kernels.gradients import Gradients, Wanted
 from difftetvr.rendering.kernels.layout import GradientSource, collect

@@ -64,11 +64,13 @@ def inspect_rays(
     quality = mesh.quality()
     # A field per cell makes the smallest vertex records; its only channel carries the quality.
     field = Field(quality[:, None], torch.zeros_like(quality), "cell")
-    view = prepare_view(mesh, field, camera, ViewOptions(renderer=renderer))
+    view = prepare_view(mesh, field, camera, ViewOptions(renderer=renderer), clip_plane)
+    if not math.prod(view.shape):
+        empty = quality.new_zeros(view.shape)
+        return RayStatistics(empty.int(), empty)
     backend, rays = view.task.backend, math.prod(view.shape)
-    limits = view.limits(clip_plane)
     with backend.exclusive():
-        tracer = view.tracer(limits)
+        tracer = view.tracer(view.limits)
         count, worst = dr.zeros(backend.Int, rays), dr.zeros(backend.Float, rays)
         tracer.trace(lambda rays: _InspectionKernel(tracer, rays, count, worst))
         counts, least = backend.tensor(count, *view.shape), backend.tensor(worst, *view.shape)

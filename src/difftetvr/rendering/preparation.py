@@ -24,7 +24,8 @@ from difftetvr.rendering.scalar_field import ScalarField
 from difftetvr.rendering.task import TRACERS, Content, RenderTask
 from difftetvr.rendering.traversal.crossing import Tracer
 from difftetvr.rendering.traversal.rays import KernelRays
-from difftetvr.rendering.upload import Extent, LaidOut, Upload, lay_out, lay_out_for_bundle, lay_out_for_camera
+from difftetvr.rendering.upload import Extent, LaidOut, Upload, lay_out
+from difftetvr.rendering.viewpoints import Viewpoint
 
 RENDERERS = tuple(TRACERS)
 CAMERAS = "pass a difftetvr.Camera, a list of cameras, or difftetvr.Rays"
@@ -54,6 +55,7 @@ class PreparedView:
         parts: What the volume holds, see :data:`difftetvr.rendering.task.Content`; densities are in that unit.
         unit: The unit, in world units.
         bundle: The rays, where they are not a camera's.
+        limits: (N, 2) distances in that unit between which rays are looked at; None for all in front of their origins.
         rays: The rays as kernels read them.
         upload: What was sent to kernels.
         laid_out: What they made of it.
@@ -66,18 +68,19 @@ class PreparedView:
     parts: tuple[torch.Tensor, ...]
     unit: float
     bundle: PreparedRays | None
+    limits: torch.Tensor | None
     rays: KernelRays
     upload: Upload
     laid_out: LaidOut
 
     def tracer(self, limits: torch.Tensor | None) -> Tracer:
-        """What crosses the mesh along the rays, between (N, 2) limits; None for all in front of their origins."""
+        """What crosses the mesh along the rays, between (N, 2) limits, which may lie behind those of the view."""
         return self.task.tracer(self.upload, self.laid_out, limits, self.rays, self.parts)
 
-    def shot(self, limits: torch.Tensor | None) -> Shot:
-        """The view between (N, 2) limits, ready to be rendered."""
+    def shot(self) -> Shot:
+        """The view, ready to be rendered."""
         shift = None if self.bundle is None else self.task.backend.floats(self.bundle.shift)
-        return Shot(self.tracer(limits), self.rays.count, shift, self.unit)
+        return Shot(self.tracer(self.limits), self.rays.count, shift, self.unit)
 
     def empty(self, shape: tuple[int, ...]) -> torch.Tensor:
         """What there is to see of no rays, in the precision of the mesh; autograd knows what it is no part of."""
@@ -90,22 +93,13 @@ class PreparedView:
         """(N, 6) origins and unit directions of the rays, in that unit; None where they are a camera's."""
         return None if self.bundle is None else self.bundle.lines
 
-    def limits(self, clip_plane: Any) -> torch.Tensor | None:
-        """(N, 2) distances in that unit between which rays are looked at, before a plane if there is one.
-
-        None for all in front of their origins.
-        """
-        origin, like = self.task.mesh.origin, self.vertices
-        if self.bundle is None:
-            assert self.task.camera is not None
-            if clip_plane is None:
-                return None
-            return clip_limits(clip_plane, self.task.camera, like, origin).reshape(-1, 2) / self.unit
-        return self.bundle.limits(clip_plane, origin, self.unit)
-
 
 def prepare_view(
-    mesh: TetMesh, field: Field | ScalarField | CellFeatures, camera: RaySource | Rays, options: ViewOptions
+    mesh: TetMesh,
+    field: Field | ScalarField | CellFeatures,
+    camera: RaySource | Rays,
+    options: ViewOptions,
+    clip_plane: Any = None,
 ) -> PreparedView:
     """Check a view's inputs and bring them to kernels; arguments and errors are those of :func:`difftetvr.render`."""
     options = _checked(mesh, field, camera, options)
@@ -122,12 +116,13 @@ def prepare_view(
     passed: _Passed
     if isinstance(source, Camera):
         shape: tuple[int, ...] = (source.height, source.width)
-        passed = _Passed(mesh.vertices, handed_over(source.world_to_camera, mesh.vertices), parts, 1.0)
+        clip = None if clip_plane is None else clip_limits(clip_plane, source, mesh.vertices, mesh.origin)
+        passed = _Passed(mesh.vertices, handed_over(source.world_to_camera, mesh.vertices), parts, 1.0, clip)
     else:
         shape = tuple(source.shape)
         order = image_order(shape, mesh.vertices.device)
-        bundle = PreparedRays.of(source, mesh)
-        passed = _Passed(mesh.vertices, None, parts, 1.0)
+        bundle = PreparedRays.of(source, mesh, clip_plane)
+        passed = _Passed(mesh.vertices, None, parts, 1.0, None)
     has_features = isinstance(field, CellFeatures) and content != "cell"
     task = RenderTask(
         backend_for(mesh.vertices),
@@ -153,12 +148,13 @@ def prepare_view(
 
 @dataclass(frozen=True)
 class _Passed:
-    """What is passed to kernels: see :class:`PreparedView`."""
+    """What is passed to kernels, see :class:`PreparedView`; and (H, W, 2) ends of a camera's rays in world units."""
 
     vertices: torch.Tensor
     pose: torch.Tensor | None
     parts: tuple[torch.Tensor, ...]
     unit: float
+    clip: torch.Tensor | None
 
 
 def _laid_out(task: RenderTask, shape: tuple[int, ...], passed: _Passed, bundle: PreparedRays | None) -> PreparedView:
@@ -166,18 +162,18 @@ def _laid_out(task: RenderTask, shape: tuple[int, ...], passed: _Passed, bundle:
     parts = tuple(part.to(backend.dtype) for part in passed.parts)
     if bundle is not None:
         bundle = bundle.in_unit(passed.unit, backend.dtype)
+        limits = bundle.limits(passed.unit)
+    else:
+        limits = None if passed.clip is None else passed.clip.reshape(-1, 2).to(backend.dtype) / passed.unit
     with backend.exclusive():
         rays: Any = task.rays(None if bundle is None else bundle.lines)
         upload = task.upload(passed.vertices, passed.pose, parts)
-        if task.renderer != "marching":
-            laid_out = lay_out(upload)
-        elif bundle is None:
-            laid_out = lay_out_for_camera(upload, rays)
-        else:
-            laid_out = lay_out_for_bundle(upload, rays, bundle.sees_all)
-            # Known by now; asked again, the host would wait again.
-            bundle = replace(bundle, sees_all=torch.tensor(laid_out.entries is not None))
-    return PreparedView(task, shape, passed.vertices, passed.pose, parts, passed.unit, bundle, rays, upload, laid_out)
+        laid_out = lay_out(upload, rays, task.plan(rays, bundle, limits))
+    if laid_out.sees_all:
+        limits = None
+    return PreparedView(
+        task, shape, passed.vertices, passed.pose, parts, passed.unit, bundle, limits, rays, upload, laid_out
+    )
 
 
 def _is_common(view: PreparedView) -> bool:
@@ -203,7 +199,7 @@ def _uncommon(task: RenderTask, passed: _Passed) -> tuple[RenderTask, _Passed]:
         Field(color, parts[1], task.content).validate(mesh)
     vertices, unit = _unit_of_length(positions, mesh)
     task = replace(task, backend=backend_for(vertices))
-    return task, _Passed(vertices, None, _parts_by_unit(task.content, parts, unit), unit)
+    return task, _Passed(vertices, None, _parts_by_unit(task.content, parts, unit), unit, passed.clip)
 
 
 def _checked(mesh: Any, field: Any, camera: Any, options: ViewOptions) -> ViewOptions:
@@ -256,32 +252,8 @@ def _content(
         field = field.as_field()
     if field.harmonics is not None:
         field.validate(mesh)
-        field = _seen(mesh, field, camera)
+        field = Viewpoint.of(mesh, camera).seen(field, mesh)
     return location, (field.color, field.density)
-
-
-def _seen(mesh: TetMesh, field: Field, camera: Camera | Rays) -> Field:
-    """A field whose colours depend on the direction, as a camera or rays that share a viewpoint see it."""
-    if isinstance(camera, Camera):
-        return field.seen_from(mesh, camera.position)
-    rays = camera.relative_to(mesh.origin)
-    if (eye := rays.eye) is not None:
-        return field.seen_from(mesh, eye)
-    origins, directions = rays.origins.reshape(-1, 3), rays.directions.reshape(-1, 3)
-    if not len(origins):
-        return field.seen_from(mesh, mesh.vertices.new_zeros(3))
-    if _are_one(origins):
-        return field.seen_from(mesh, origins.mean(0))
-    if _are_one(directions):
-        return field.seen_along(directions.mean(0))
-    raise DiffTetError(
-        "The field's colours depend on the direction (harmonics), and are known here for rays that start at one point, "
-        "or go in one direction; ask for each camera by itself, or pass a field without harmonics."
-    )
-
-
-def _are_one(vectors: torch.Tensor) -> bool:
-    return bool((vectors.detach() == vectors[:1].detach()).all())
 
 
 def _camera_space(mesh: TetMesh, camera: Camera) -> torch.Tensor:

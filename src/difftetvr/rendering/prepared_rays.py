@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,7 +9,7 @@ import torch
 
 from difftetvr.mesh import TetMesh
 from difftetvr.rendering.clip_plane import clip_rays
-from difftetvr.rendering.rays import Rays, unit_vectors
+from difftetvr.rendering.rays import Rays, short_unit_vectors, unit_vectors
 
 KNOW_FLOAT64 = ("cpu", "cuda")
 """Devices that compute in float64."""
@@ -24,22 +23,20 @@ class PreparedRays:
         lines: (N, 6) origins and unit directions, the origins in the unit of kernels.
         shift: (N,) how far these origins are from the true ones, in world units.
         near, far: (N,) distances from the true origins between which rays are looked at, in world units.
-        sees_all: Whether no ray starts or ends near the mesh, a bool where the rays are; on the host, once it is known.
-        origins: (N, 3) the true origins, relative to that of the mesh.
-        directions: (N, 3) unit directions.
+        sees_all: Whether no ray starts or ends near the mesh; a tensor where the host would have to wait for it.
+        begins_at_point: Whether all rays are known to be looked at from one point on.
     """
 
     lines: torch.Tensor
     shift: torch.Tensor
     near: torch.Tensor
     far: torch.Tensor
-    sees_all: torch.Tensor
-    origins: torch.Tensor
-    directions: torch.Tensor
+    sees_all: bool | torch.Tensor
+    begins_at_point: bool
 
     @staticmethod
-    def of(rays: Rays, mesh: TetMesh) -> PreparedRays:
-        """Count rays anew from near a mesh; differentiable in them."""
+    def of(rays: Rays, mesh: TetMesh, clip_plane: Any) -> PreparedRays:
+        """Count rays, before a plane if there is one, anew from near a mesh; differentiable in them."""
         device = mesh.vertices.device
         dtype = torch.float64 if device.type in KNOW_FLOAT64 else mesh.vertices.dtype
         rays = rays.relative_to(mesh.origin)
@@ -48,26 +45,30 @@ class PreparedRays:
         eye = rays.eye
         origins = (rays.origins.reshape(-1, 3) if eye is None else eye).to(device, dtype).expand_as(directions)
         near, far = (end.reshape(-1).to(device, dtype) for end in rays.ends)
-        directions = unit_vectors(directions)
-        low, high = torch.aminmax(mesh.vertices.detach().to(dtype), dim=0)
-        center, radius = 0.5 * (low + high), 0.5 * (high - low).square().sum().sqrt()
+        is_narrow = rays.directions.dtype != torch.float64 and dtype == torch.float64
+        directions = short_unit_vectors(directions) if is_narrow else unit_vectors(directions)
+        vertices = mesh.vertices.detach()
+        low, high = vertices.amin(0).to(dtype), vertices.amax(0).to(dtype)
+        center, radius = torch.lerp(low, high, 0.5), 0.5 * torch.linalg.vector_norm(high - low)
         shift = ((center - origins.detach()) * directions.detach()).sum(1)
-        lines = torch.cat((origins + shift[:, None] * directions, directions), dim=1)
-        beyond = (shift.abs() + radius).mul(1.0 + 1e-5)
-        sees_all = ((near <= shift - 1.001 * radius) & (far >= beyond)).all()
-        if near.requires_grad or far.requires_grad:
-            sees_all = torch.tensor(False)
-        return PreparedRays(lines, shift, near, far, sees_all, origins, directions)
-
-    def limits(self, clip_plane: Any, origin: Sequence[float], unit: float) -> torch.Tensor | None:
-        """(N, 2) distances from these origins in the unit of kernels; None where nothing is cut off."""
-        if clip_plane is None and self.sees_all:
-            return None
-        near, far = self.near, self.far
+        lines = torch.cat((torch.addcmul(origins, shift[:, None], directions), directions), dim=1)
         if clip_plane is not None:
-            first, last = clip_rays(clip_plane, self.origins, self.directions, origin)
+            first, last = clip_rays(clip_plane, origins, directions, mesh.origin)
             near, far = torch.maximum(near, first), torch.minimum(far, last)
-        return torch.stack((near - self.shift, far - self.shift), dim=1) / unit
+        sees_all: bool | torch.Tensor = False
+        if clip_plane is None and not (near.requires_grad or far.requires_grad):
+            # How far from the centre rays begin and end, at least: they see all where that is beyond the mesh.
+            away = torch.minimum(shift - near, far - (1.0 + 1e-5) * shift.abs())
+            sees_all = away.amin() >= 1.001 * radius if len(away) else away.new_ones((), dtype=torch.bool)
+            sees_all = bool(sees_all) if device.type == "cpu" else sees_all
+        begins_at_point = device.type == "cpu" and not sees_all and _are_one(origins, directions, near)
+        return PreparedRays(lines, shift, near, far, sees_all, begins_at_point)
+
+    def limits(self, unit: float) -> torch.Tensor | None:
+        """(N, 2) distances from these origins in the unit of kernels; None where nothing is known to be cut off."""
+        if self.sees_all is True:
+            return None
+        return torch.stack((self.near - self.shift, self.far - self.shift), dim=1) / unit
 
     def in_unit(self, unit: float, dtype: torch.dtype) -> PreparedRays:
         """The same with origins in a unit of kernels, in world units, and at their precision."""
@@ -75,3 +76,10 @@ class PreparedRays:
         if unit != 1.0:
             lines = lines * lines.new_tensor([1.0 / unit] * 3 + [1.0] * 3)
         return replace(self, lines=lines.to(dtype))
+
+
+@torch.no_grad()
+def _are_one(origins: torch.Tensor, directions: torch.Tensor, near: torch.Tensor) -> bool:
+    """Whether the points at some distances along lines are one."""
+    begin = origins + near[:, None] * directions
+    return bool((begin == begin[:1]).all())

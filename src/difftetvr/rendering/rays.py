@@ -103,10 +103,7 @@ class Rays:
 
         No values are compared: rays with equal origins of their own may start at one point and not know it.
         """
-        sizes, strides = self.origins.shape[:-1], self.origins.stride()[:-1]
-        if 0 in sizes or any(size > 1 and stride != 0 for size, stride in zip(sizes, strides, strict=True)):
-            return None
-        return self.origins[(0,) * len(sizes)]
+        return one_vector(self.origins)
 
     @property
     def _starts(self) -> torch.Tensor:
@@ -188,13 +185,26 @@ class Rays:
         return Rays(*(torch.cat(part) for part in zip(*parts, strict=True)))
 
 
+def one_vector(vectors: torch.Tensor) -> torch.Tensor | None:
+    """(3,) the one vector that (..., 3) vectors are in memory; None where they are several, or none."""
+    sizes, strides = vectors.shape[:-1], vectors.stride()[:-1]
+    if 0 in sizes or any(size > 1 and stride != 0 for size, stride in zip(sizes, strides, strict=True)):
+        return None
+    return vectors[(0,) * len(sizes)]
+
+
 def unit_vectors(vectors: torch.Tensor) -> torch.Tensor:
     """(..., 3) vectors of length 1, of such of any length but 0, whose squares need not be numbers."""
     exponent = vectors.detach().abs().amax(-1, keepdim=True).log2().floor()
     most = 1000 if vectors.dtype == torch.float64 else 120
     # A power of two: vectors of common lengths come to the very bits they would come to without.
     scale = torch.ldexp(torch.ones_like(vectors[..., :1]), -exponent.clamp(-most, most))
-    return torch.nn.functional.normalize(vectors * scale, dim=-1, eps=0.0)
+    return short_unit_vectors(vectors * scale)
+
+
+def short_unit_vectors(vectors: torch.Tensor) -> torch.Tensor:
+    """The same of vectors whose squares are numbers."""
+    return vectors / torch.linalg.vector_norm(vectors, dim=-1, keepdim=True)
 
 
 @runtime_checkable

@@ -13,7 +13,10 @@ from difftetvr.mesh import TetMesh
 from difftetvr.optics import OpticalModel
 from difftetvr.rendering.cameras.pinhole import Camera
 from difftetvr.rendering.kernels.layout import CellSource, VertexSource
+from difftetvr.rendering.prepared_rays import PreparedRays
+from difftetvr.rendering.search.bundle_hits import Stretches
 from difftetvr.rendering.search.memory_order import MemoryOrder
+from difftetvr.rendering.search.plan import SearchPlan
 from difftetvr.rendering.tracers.aim import Aim
 from difftetvr.rendering.tracers.linked_list import LinkedList
 from difftetvr.rendering.tracers.marching import Marching
@@ -105,6 +108,25 @@ class RenderTask:
         assert self.camera is not None
         return self.camera.kernel_rays(self.backend)
 
+    def plan(self, rays: KernelRays, bundle: PreparedRays | None, limits: torch.Tensor | None) -> SearchPlan | None:
+        """What the tracer has to know of the rays first.
+
+        Args:
+            rays: The rays.
+            bundle: The same, where they are not a camera's.
+            limits: (N, 2) distances between which each ray is looked at; None for all of it.
+        """
+        backend, stretches = self.backend, None
+        if not rays.count:
+            return None
+        if bundle is not None:
+            ends = None if limits is None else backend.floats(limits)
+            flag = bundle.sees_all
+            sees_all = None if isinstance(flag, bool) else backend.floats(flag.to(backend.dtype)[None])
+            stretches = Stretches(backend.lanes(rays.lane_count), ends, sees_all, bundle.begins_at_point)
+        plan: SearchPlan | None = TRACERS[self.renderer].plan(backend, self.mesh, rays, stretches)
+        return plan
+
     def tracer(
         self, upload: Upload, laid_out: LaidOut, limits: torch.Tensor | None, rays: KernelRays, parts: Any
     ) -> Tracer:
@@ -131,7 +153,6 @@ class RenderTask:
             None if limits is None else backend.floats(limits),
             backend.lanes(rays.lane_count),
         )
-        ordered = upload.ordered(laid_out.records, laid_out.device_extent, laid_out.extent.largest)
-        scene = upload.scene(laid_out.records, rays)
-        tracer: Tracer = TRACERS[self.renderer].of(Aim(view, scene, ordered, self.mesh, laid_out.entries))
+        aim = Aim(view, upload.scene(laid_out.records, rays), self.mesh, laid_out.found)
+        tracer: Tracer = TRACERS[self.renderer].of(aim)
         return tracer

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, cast
 
 import drjit as dr
-import torch
 
 from difftetvr.backend import Backend
 from difftetvr.mesh import TetMesh
@@ -19,16 +18,14 @@ from difftetvr.rendering.kernels.layout import (
     lay_out_cells,
     lay_out_vertices,
 )
-from difftetvr.rendering.search.bundle_hits import BundleSearch
-from difftetvr.rendering.search.camera_hits import CameraLanes, CameraSearch
-from difftetvr.rendering.search.entry import EntryCounts, EntryLists, count_entries, list_entries
-from difftetvr.rendering.search.memory_order import MemoryOrder, MeshTables, OrderedMesh
+from difftetvr.rendering.search.memory_order import MemoryOrder, MeshTables
+from difftetvr.rendering.search.plan import Found, SearchPlan, Told
 from difftetvr.rendering.search.scene import Scene
-from difftetvr.rendering.search.starts import AROUND, EXTENT, PointStarts
-from difftetvr.rendering.traversal.bundle import BundleRays
-from difftetvr.rendering.traversal.rays import ImageRays
+from difftetvr.rendering.search.starts import EXTENT
+from difftetvr.rendering.traversal.rays import KernelRays
 
-_SUMMARY = EXTENT + 4
+_NUMBERS = 8
+"""Floats behind an extent that tell the host what was found; one packet, which EXTENT is a multiple of."""
 
 
 @dataclass(frozen=True)
@@ -53,12 +50,6 @@ class Upload:
     def lengths(self) -> tuple[int, int]:
         """Numbers of records to make for vertices and cells."""
         return few_lengths(self.mesh.num_vertices), few_lengths(self.mesh.num_cells)
-
-    def ordered(self, records: Any, extent: Any, largest: float | None = None) -> OrderedMesh:
-        """The mesh in the order of memory, with laid out vertices."""
-        return OrderedMesh(
-            self.vertices.backend, self.order, self.tables, records, self.vertices.stride, extent, largest
-        )
 
     def scene(self, records: Any, rays: Any) -> Scene:
         """The cells, with laid out vertices, in the space of some rays."""
@@ -97,91 +88,60 @@ class LaidOut:
     Attributes:
         records: Of vertices.
         cells: Of cells; None where they hold nothing.
-        device_extent: Where vertices are, on the device.
-        extent: The same.
-        entries: Where rays enter the mesh; None where that was not looked for.
+        extent: Where vertices are.
+        found: What was looked for in it, as the plan has settled it; None where nothing was.
+        sees_all: Whether no ray turned out to begin or end near the mesh.
     """
 
     records: Any
     cells: Any | None
-    device_extent: Any
     extent: Extent
-    entries: EntryLists | None
+    found: Any | None
+    sees_all: bool
 
 
-def lay_out(upload: Upload) -> LaidOut:
-    """Lay out a mesh."""
-    records, cells, extent = replayed(_lay_out, upload.vertices, upload.cells, *upload.lengths)
-    return LaidOut(records, cells, extent, Extent.of(extent.numpy().tolist()), None)
-
-
-def lay_out_for_camera(upload: Upload, rays: ImageRays, capacity: int = AROUND) -> LaidOut:
-    """Lay out a mesh in camera space, and find where a camera's rays enter it; the host waits for both together.
+def lay_out(upload: Upload, rays: KernelRays, plan: SearchPlan | None) -> LaidOut:
+    """Lay out a mesh in the space of rays, and look for what is planned; the host waits for both together.
 
     Args:
-        upload: The mesh, whose cells are joined.
+        upload: The mesh.
         rays: The rays.
-        capacity: Cells around the camera that there is room for.
+        plan: What to look for; None for nothing.
     """
-    backend, tables = upload.vertices.backend, upload.tables
-    lanes = CameraLanes.of(backend, rays, tables.faces, upload.mesh.num_cells, capacity)
-    found = replayed(_lay_out_and_count, upload.vertices, upload.cells, upload.lengths, tables, rays, lanes)
-    summary = _Summary.read(found.summary)
-    around = summary.last
-    if around > capacity:
-        return lay_out_for_camera(upload, rays, few_lengths(around))
-    starts = PointStarts(found.around, found.around_count, tables.adjacency, lanes.pixel)
-    scene = upload.scene(found.records, rays)
-    search = CameraSearch(scene, tables.boundary, lanes.worker, starts, tables.faces, lanes.workers)
-    entries = list_entries(search, found.counts, summary.most, summary.total, around > 0)
-    return LaidOut(found.records, found.cells, found.extent, summary.extent, entries)
+    if plan is None:
+        records, cells, extent = replayed(_lay_out, upload.vertices, upload.cells, *upload.lengths)
+        return LaidOut(records, cells, Extent.of(extent.numpy().tolist()), None, False)
+    made: _Made = replayed(_lay_out_and_find, upload.vertices, upload.cells, upload.lengths, upload.tables, rays, plan)
+    extent, told = _read(made.summary)
+    if made.found.around is not None and told.around > plan.capacity:
+        roomier: Any = replace(cast("Any", plan), capacity=few_lengths(told.around))
+        return lay_out(upload, rays, roomier)
+    found = plan.settled(upload.scene(made.records, rays), made.found, told)
+    return LaidOut(made.records, made.cells, extent, found, told.sees_all)
 
 
-def lay_out_for_bundle(upload: Upload, rays: BundleRays, sees_all: torch.Tensor) -> LaidOut:
-    """Lay out a mesh, and find where a bundle's rays enter it if they see all of it; the host waits for both together.
+@dataclass
+class _Made:
+    """What kernels made of an upload, and (SUMMARY,) what the host has to hear of it."""
 
-    Args:
-        upload: The mesh, whose cells are joined.
-        rays: The rays.
-        sees_all: Whether no ray starts or ends near the mesh. Where a GPU has still to tell, it is taken for granted
-            until the host has to wait anyhow; if that was wrong, the entries are those of nobody, and not returned.
-    """
-    if not rays.count or (sees_all.device.type == "cpu" and not sees_all):
-        return lay_out(upload)
-    backend = upload.vertices.backend
-    records, cells, extent = replayed(_lay_out, upload.vertices, upload.cells, *upload.lengths)
-    search = BundleSearch.for_entries(upload.scene(records, rays), upload.ordered(records, extent), None)
-    counts = replayed(count_entries, search, rays.count)
-    is_wanted = backend.floats(sees_all.to(backend.device, backend.dtype)[None])
-    summary = _Summary.read(replayed(_summarised, backend, extent, counts, is_wanted))
-    entries = list_entries(search, counts, summary.most, summary.total, False) if summary.last else None
-    return LaidOut(records, cells, extent, summary.extent, entries)
+    records: Any
+    cells: Any | None
+    found: Found
+    summary: Any
 
 
-@dataclass(frozen=True)
-class _Summary:
-    """What the host has to know before it goes on: the extent, how many entries there are, and one number more."""
-
-    extent: Extent
-    most: int
-    total: int
-    last: int
-
-    @staticmethod
-    def read(numbers: Any) -> _Summary:
-        """From what :func:`_summarised` makes, for which the host waits."""
-        found = numbers.numpy().tolist()
-        return _Summary(Extent.of(found), int(found[EXTENT]), int(found[-3]) << 16 | int(found[-2]), int(found[-1]))
-
-
-def _summarised(backend: Backend, extent: Any, counts: EntryCounts, last: Any) -> Any:
-    """One array, for one wait; halves, for floats do not hold all integers."""
-    summary, total = dr.empty(backend.Float, _SUMMARY), counts.total
-    dr.scatter(summary, extent, dr.arange(backend.UInt, EXTENT))
-    numbers = (counts.most, total >> 16, total & 0xFFFF, last)
-    dr.scatter(summary, backend.Floats([backend.Float(number) for number in numbers]), backend.UInt(EXTENT // 4))
-    dr.eval(summary)
-    return summary
+def _lay_out_and_find(
+    vertices: VertexSource,
+    cells: CellSource | None,
+    lengths: tuple[int, int],
+    tables: MeshTables,
+    rays: KernelRays,
+    plan: SearchPlan,
+) -> _Made:
+    backend = vertices.backend
+    records, cell_records, extent = _lay_out(vertices, cells, *lengths)
+    found = plan.find(Scene(backend, records, tables.tets, vertices.stride, rays), extent)
+    return _Made(records, cell_records, found, _summary(backend, extent, found, plan.sees_all))
 
 
 def _lay_out(vertices: VertexSource, cells: CellSource | None, vertex_length: int, cell_length: int) -> Any:
@@ -193,29 +153,23 @@ def _lay_out(vertices: VertexSource, cells: CellSource | None, vertex_length: in
     return records, cell_records, extent
 
 
-@dataclass
-class _Found:
-    records: Any
-    cells: Any | None
-    extent: Any
-    around: Any
-    around_count: Any
-    counts: EntryCounts
-    summary: Any
+def _summary(backend: Backend, extent: Any, found: Found, sees_all: Any | None) -> Any:
+    """One array, for one wait; halves, for floats do not hold all integers."""
+    summary, none = dr.empty(backend.Float, EXTENT + _NUMBERS), dr.zeros(backend.UInt, 1)
+    dr.scatter(summary, extent, dr.arange(backend.UInt, EXTENT))
+    around = none if found.around is None else found.around.count
+    whole = (found.counts.most, found.counts.total, around)
+    halves = [half for number in whole for half in (number >> 16, number & 0xFFFF)]
+    numbers = [*(backend.Float(half) for half in halves), backend.Float(0) if sees_all is None else sees_all]
+    numbers += [backend.Float(0)] * (_NUMBERS - len(numbers))
+    dr.scatter(summary, backend.Floats(numbers), backend.UInt(EXTENT // _NUMBERS))
+    dr.eval(summary)
+    return summary
 
 
-def _lay_out_and_count(
-    vertices: VertexSource,
-    cells: CellSource | None,
-    lengths: tuple[int, int],
-    tables: MeshTables,
-    rays: ImageRays,
-    lanes: CameraLanes,
-) -> _Found:
-    backend: Backend = vertices.backend
-    records, cell_records, extent = _lay_out(vertices, cells, *lengths)
-    scene = Scene(backend, records, tables.tets, vertices.stride, rays)
-    search = CameraSearch.of(scene, tables, lanes, extent)
-    counts = count_entries(search, rays.count)
-    summary = _summarised(backend, extent, counts, search.starts.count)
-    return _Found(records, cell_records, extent, search.starts.cells, search.starts.count, counts, summary)
+def _read(summary: Any) -> tuple[Extent, Told]:
+    """What :func:`_summary` tells, for which the host waits."""
+    numbers = summary.numpy().tolist()
+    halves = [int(number) for number in numbers[EXTENT : EXTENT + 6]]
+    most, total, around = (high << 16 | low for high, low in zip(halves[::2], halves[1::2], strict=True))
+    return Extent.of(numbers), Told(most, total, around, numbers[EXTENT + 6] > 0)

@@ -15,7 +15,7 @@ from torch.autograd.function import once_differentiable
 from difftetvr.backend import Backend, backend_for
 from difftetvr.memory import tried_twice
 from difftetvr.mesh import TetMesh
-from difftetvr.rendering.flags import flags_here, with_flags
+from difftetvr.rendering.kernels.flags import flags_here, with_flags
 from difftetvr.sampling.location import NOWHERE, CellReader, cross, dot
 
 

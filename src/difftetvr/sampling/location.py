@@ -15,7 +15,7 @@ import torch
 
 from difftetvr.backend import Backend, backend_for
 from difftetvr.mesh import TetMesh
-from difftetvr.rendering.search.hierarchy import CELLS_OF_A_LEAF, Hierarchy, curve_order, sorted_cells
+from difftetvr.rendering.search.hierarchy import Hierarchy, curve_order, leaves_of_cells
 from difftetvr.rendering.search.scene import Cells
 
 NOWHERE = -1
@@ -78,9 +78,9 @@ def locate(mesh: TetMesh, vertices: torch.Tensor, points: torch.Tensor) -> torch
     if not count or not mesh.num_cells:
         return torch.full((count,), NOWHERE, dtype=torch.int32, device=vertices.device)
     with backend.exclusive():
-        hierarchy = Hierarchy.over(backend, sorted_cells(mesh.topology, vertices), vertices.detach(), CELLS_OF_A_LEAF)
         order = curve_order(points)  # so that neighbouring lanes look at the same cells
         reader, flat = CellReader.of(backend, mesh, vertices), backend.floats(points[order])
+        hierarchy = Hierarchy.over(leaves_of_cells(backend, mesh.topology, lambda: vertices), reader)
         lane = dr.arange(uint, count)
         point = [dr.gather(backend.Float, flat, 3 * lane + axis) for axis in range(3)]
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator
 from dataclasses import replace
+from types import SimpleNamespace
 
+import drjit as dr
 import pytest
 import torch
 from oracle.oracle import render_oracle
@@ -17,9 +19,11 @@ from difftetvr.errors import DiffTetError, MeshError
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.rendering import Camera, OrderWarning, render
 from difftetvr.rendering.inspection import inspect_rays
+from difftetvr.rendering.search.plan import Counts
 from difftetvr.rendering.search.scene import Scene as CellScene
 from difftetvr.rendering.tracers import linked_list, projected
 from difftetvr.rendering.tracers.bands import bands_of
+from difftetvr.rendering.tracers.fragments import Fragments
 from difftetvr.rendering.tracers.tiles import Tiler
 
 RENDERERS = ("marching", "linked-list", "projected")
@@ -86,6 +90,31 @@ def test_lists_longer_than_local_memory_in_many_bands(name: str, monkeypatch: py
     monkeypatch.setattr(linked_list, "LOCAL_SIZES", (4,))
     monkeypatch.setattr(linked_list, "FRAGMENT_BUDGET", 200)
     assert_agrees(SCENES[name](), torch.float64, 1e-10, 1e-8, renderer="linked-list")
+
+
+def test_many_bands_are_not_replayed_but_waited_for_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Launched from a recording, kernels of all bands are queued at once, with the lists of all of them."""
+    scene, made, of = SCENES["inside"](), [], linked_list.FragmentLists.of
+    monkeypatch.setattr(linked_list, "FRAGMENT_BUDGET", 200)
+    monkeypatch.setattr(linked_list.FragmentLists, "of", lambda *given: made.append(0) or of(*given))
+    counts = []
+    for _ in range(2):
+        made.clear()
+        render_scene(scene, torch.float32, renderer="linked-list")
+        counts.append(len(made))
+    assert counts[0] > 1 and counts[1] == counts[0]
+
+
+def test_more_fragments_than_32_bits_count_are_held_in_bands() -> None:
+    backend = backend_for(torch.zeros(1))
+    counts = Counts.of(dr.full(backend.UInt, 1 << 30, 4), None)
+    assert int(counts.total[0]) == 0
+    found = Fragments(None, counts.count, 1 << 30, 0, False)
+    view = SimpleNamespace(backend=backend, rays=SimpleNamespace(lane_count=4))
+    tracer = linked_list.LinkedList.of(SimpleNamespace(view=view, found=found))
+    bands = list(tracer.bands.each(backend))
+    assert [band.size for band in bands] == [1 << 30] * 4
+    assert [band.lane.numpy().tolist() for band in bands] == [[0], [1], [2], [3]]
 
 
 def test_bands_hold_all_lanes_within_the_budget() -> None:

@@ -1,6 +1,7 @@
 """The viewer in browsers without a window: pictures, drags, edits, several clients, and what stays in memory."""
 
 import io
+import logging
 import socket
 import threading
 import time
@@ -67,12 +68,18 @@ def browser(served) -> Iterator[Browser]:
     if CHROMIUM is None:
         pytest.skip("no Chromium")
     with Browser(*SIZE) as browser:
-        browser.visit(served.server.address)
-        wait_until(lambda: len(served.clients) == 1)
-        close = "document.querySelectorAll('.mantine-Notification-closeButton')"
-        browser.wait_for(f"{close}.length")
-        browser.run(f"{close}.forEach(button => button.click())")
+        open_in(browser, served)
         yield browser
+
+
+def open_in(browser, served) -> None:
+    """Opens the page, without what it says of browsers that draw without a GPU."""
+    browser.visit(served.server.address)
+    wait_until(lambda: len(served.clients) == 1)
+    close = "document.querySelectorAll('.mantine-Notification-closeButton')"
+    browser.wait_for(f"{close}.length")
+    browser.run(f"{close}.forEach(button => button.click())")
+    wait_until(lambda: not browser.run(f"{close}.length"))
 
 
 @pytest.fixture(autouse=True)
@@ -275,6 +282,55 @@ def test_pages_of_other_sites_are_refused(served):
                 with pytest.raises(ConnectionClosed):
                     other.recv(timeout=_PATIENCE)
                 assert other.close_code == 1008
+
+
+def test_garbage_harms_nobody_and_is_not_told_with_a_traceback(tmp_path, capfd, monkeypatch):
+    from websockets.exceptions import ConnectionClosed
+    from websockets.sync.client import connect
+
+    monkeypatch.setattr(logging.getLogger(), "handlers", [])  # those of pytest, which no user has
+    with LiveServer(scenes.colored(), Listening(tmp_path, port=0)) as server:
+        with socket.create_connection(("127.0.0.1", server.desk.server.get_port())) as line:
+            line.sendall(bytes(range(256)))
+            assert line.recv(1) == b""
+        address, protocol = server.address.replace("http", "ws"), f"viser-v{__import__('viser').__version__}"
+        for garbage in ("words", b"\xff", b"\x81\xa4type\xa7Nothing"):
+            with connect(address, subprotocols=[protocol], max_size=None) as stranger:
+                stranger.send(garbage)
+                with pytest.raises(ConnectionClosed):
+                    while True:
+                        stranger.recv(timeout=_PATIENCE)
+        with connect(address, subprotocols=[protocol], max_size=None) as other:
+            assert other.recv(timeout=_PATIENCE)
+        wait_until(lambda: not server.is_watched)
+    assert "Traceback" not in capfd.readouterr().err
+
+
+def test_a_click_on_a_frustum_looks_through_its_camera(tmp_path):
+    if CHROMIUM is None:
+        pytest.skip("no Chromium")
+    scene = scenes.photographed()
+    asked = scene.views.cameras[1]
+    served = Served(scene, tmp_path)
+    try:
+        with Browser(*SIZE) as browser:
+            open_in(browser, served)
+            client = next(iter(served.clients.values()))
+            camera = served.server.desk.camera_of(client)
+            # Amid its frustum, which is some pixels wide.
+            place = asked.position.double() + 0.3 * asked.world_to_camera[2, :3].double()
+            x, y = (camera.project(place[None])[0][0] * SIZE[0] / camera.width).tolist()
+
+            def is_there() -> bool:
+                browser.mouse("mouseMoved", x, y)
+                browser.drag((x, y), (x, y))
+                now = served.server.desk.camera_of(client).position
+                return bool(torch.allclose(now.double(), asked.position.double(), atol=0.01))
+
+            wait_until(is_there)
+            settled(browser, served)
+    finally:
+        served.close()
 
 
 def test_no_page_can_have_the_viewer_shown_elsewhere(served):

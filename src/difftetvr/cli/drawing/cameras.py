@@ -115,6 +115,9 @@ class CameraOptions:
             raise CameraError(f"--camera {self.camera} says where the camera is; leave out --{placed[0]}.")
         if self.view is not None and len(placed) > 1:
             raise CameraError(f"--view {self.view} says where the camera is; leave out --{placed[1]}.")
+        if self.film.path is not None and (self.camera is not None or placed):
+            other = "camera" if self.camera is not None else placed[0]
+            raise CameraError(f"--path {self.film.path} says where the camera is; leave out --{other}.")
         self.film.require_valid()
 
     @property

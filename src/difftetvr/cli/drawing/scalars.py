@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -50,6 +50,11 @@ class ColorOptions:
     log: bool = False
     """Spread the colours over the logarithm of the scalar."""
 
+    def given(self) -> list[str]:
+        """Names of the options of what a scalar looks like that are given."""
+        values = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "scalar"}
+        return [name.replace("_", "-") for name, value in values.items() if value is not None and value is not False]
+
     def _opacity(self) -> OpacityPreset | None:
         return None
 
@@ -60,10 +65,16 @@ class ColorOptions:
         """What to render of a file.
 
         Raises:
-            MeshError: There is no such scalar, it is the same everywhere, or an option is out of range.
+            MeshError: There is no such scalar, it is the same everywhere, an option is out of range, or one is given
+                for what has its own colours.
             CaptureError: There is no such transfer function or colour map.
         """
         if self.scalar is None and data.field is not None:
+            if given := self.given():
+                raise MeshError(
+                    f"--{given[0]} is for scalars, but {path} has color and density; name a scalar by --scalar, or "
+                    "leave it out."
+                )
             return Shown(data.mesh, data.field)
         import torch
 
@@ -101,7 +112,8 @@ class ColorOptions:
 
         Args:
             volume: The volume.
-            function: A transfer function of its scalars; None: made by the options.
+            function: A transfer function of its scalars; None: made by the options, as it is where these say anything
+                of it but name its file.
 
         Raises:
             MeshError: An option is out of range, or the values leave no range.
@@ -114,7 +126,8 @@ class ColorOptions:
 
         self._require_valid()
         low, high = (float(end) for end in volume.value_range)
-        if function is not None:
+        says_looks = not {"colormap", "opacity", "percentile", "log"}.isdisjoint(self.given())
+        if function is not None and not says_looks:
             density = self._density(_ATTENUATION)
             return ShownVolume(volume, function, density, ColorScale("value", (low, high), function))
         # In the values of the file, of which logarithms are to be taken; but for a factor, so that nothing overflows.

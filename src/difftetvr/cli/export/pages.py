@@ -12,7 +12,6 @@ from difftetvr.errors import MeshError, counted
 from difftetvr.terminal import waiting
 
 _USUAL = ScalarOptions()
-_OF_SCALARS = ("transfer_function", "value_range", "attenuation")
 _RESULT = "model"  # what the mesh of a run is called, whose folder says more
 
 
@@ -72,14 +71,7 @@ class PageOptions:
             value_range=self.value_range,
             attenuation=self.attenuation,
         )
-        shown = options.apply(job.data, job.model)
-        given = next((n for n in _OF_SCALARS if getattr(self, n) != getattr(_USUAL, n)), None)
-        if shown.name is None and given is not None:
-            raise MeshError(
-                f"--{given.replace('_', '-')} is for scalars, but {job.model} has color and density; name a scalar by "
-                "--scalar, or leave it out."
-            )
-        return shown
+        return options.apply(job.data, job.model)
 
     def _title(self, model: Path) -> str:
         if self.title is not None:

@@ -1,4 +1,5 @@
 from . import alignment as alignment
+from . import curvature as curvature
 from . import options as options
 from . import refined as refined
 from .options import CameraRefinement as CameraRefinement

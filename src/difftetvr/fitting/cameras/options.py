@@ -15,14 +15,14 @@ class CameraRefinement(OptionGroup):
 
     prefix: ClassVar[str] = "cameras."
 
-    rate: float = 5e-3
-    """Length of the first steps of a pose: radians, and half sides of the capture's box."""
-    final_rate: float = 2e-4
-    """Length of the last steps; in between it falls log-linearly."""
+    rate: float = 2e-2
+    """Greatest length of the first steps of a pose: radians, and half sides of the capture's box."""
+    final_rate: float = 2e-3
+    """Greatest length of the last steps; in between it falls log-linearly."""
     intrinsics_rate: float = 2e-4
     """Length of the steps of intrinsics at first, in parts of the focal length and of the image's width; it falls as
     that of poses does."""
-    align_steps: int = 40
+    align_steps: int = 12
     """Steps by which the pose of each held-out view is found on its own image, the reconstruction held still, before it
     is compared; 0: compare at the poses as given."""
 
@@ -34,7 +34,7 @@ class CameraRefinement(OptionGroup):
         self._require(0 <= self.align_steps <= LARGEST_COUNT, "align_steps", "at least 0")
 
     def rate_at(self, progress: float) -> float:
-        """Length of a pose's step.
+        """Greatest length of a pose's step.
 
         Args:
             progress: Share of the run that is done, in [0, 1].

@@ -21,20 +21,23 @@ from typing import Any
 import torch
 
 from difftetvr.capture.capture import Capture
+from difftetvr.fitting.cameras.curvature import WorldMotion, gauss_newton_steps, pose_curvature
 from difftetvr.fitting.cameras.options import CameraRefinement
-from difftetvr.rendering.cameras.pinhole import Camera
+from difftetvr.rendering import Camera, RenderedImage
 
 _BETAS, _EPSILON = (0.9, 0.99), 1e-15
-_NAMES = ("motion", "motion_first", "motion_second", "motion_steps", "lens", "lens_first", "lens_second", "lens_steps")
+_KEPT = 0.5
+"""Share of a view's curvature that stays when it is seen anew: it changes as the reconstruction grows sharp."""
 
 
 class RefinedCameras:
-    """The cameras of a capture as they are now, and their Adam optimiser.
+    """The cameras of a capture as they are now, and what moves them.
 
-    Each view has moments and a count of steps of its own, for it is seen once in an epoch; rotation and translation
-    share one second moment each, so steps have no preferred axis.
+    Poses take Gauss-Newton steps, each view by itself: turning a camera and shifting it sideways move its picture
+    nearly alike, and only their curvature tells how far to go along what differs. Intrinsics have Adam's.
 
     Attributes:
+        curvature: (N, 6, 6) second derivatives of the loss by the motions of the views that an iteration has seen.
         motion: (N, 6) leaf tensor, float64: rotation vectors and translations of all views' worlds.
         lens: (3,) leaf tensor, float64: log of the factor of all focal lengths, and shifts of all principal points in
             image widths and heights.
@@ -53,18 +56,16 @@ class RefinedCameras:
         self._moves, self._zooms = poses, intrinsics
         count = len(capture.cameras)
         bounds = capture.bounds.double()
-        self._center = 0.5 * (bounds[0] + bounds[1])
-        self._unit = 0.5 * float((bounds[1] - bounds[0]).max())
+        self._world = WorldMotion(0.5 * (bounds[0] + bounds[1]), 0.5 * float((bounds[1] - bounds[0]).max()))
         self._training = capture.train_indices
         places = torch.stack([camera.position.detach().cpu().double() for camera in capture.cameras])
-        towards = (places - self._center)[self._training]
+        towards = (places - self._world.center)[self._training]
         self._towards = towards - towards.mean(0)  # so that taking growth out leaves the mean where it is
         self.motion = torch.zeros(count, 6, dtype=torch.float64).requires_grad_(poses)
         self.lens = torch.zeros(3, dtype=torch.float64).requires_grad_(intrinsics)
+        self.curvature = torch.zeros(count, 6, 6, dtype=torch.float64)
         self._state = {
-            "motion_first": torch.zeros(count, 6, dtype=torch.float64),
-            "motion_second": torch.zeros(count, 2, dtype=torch.float64),
-            "motion_steps": torch.zeros(count, 1, dtype=torch.float64),
+            "motion_curvature": torch.zeros(count, 6, 6, dtype=torch.float64),
             "lens_first": torch.zeros(3, dtype=torch.float64),
             "lens_second": torch.zeros(3, dtype=torch.float64),
             "lens_steps": torch.zeros((), dtype=torch.float64),
@@ -95,7 +96,8 @@ class RefinedCameras:
         if self._moves:
             pose = given.world_to_camera.detach()
             rotation = rotation_of(motion[:3])
-            shift = self._center + self._unit * motion[3:] - (rotation * self._center).sum(1)
+            center = self._world.center
+            shift = center + self._world.unit * motion[3:] - (rotation * center).sum(1)
             old = pose.cpu().double()
             turned = (old[:3, :3, None] * rotation[None]).sum(1)
             moved = (old[:3, :3] * shift).sum(1) + old[:3, 3]
@@ -115,8 +117,23 @@ class RefinedCameras:
         """The cameras of all views as they are now."""
         return [self.known(view) for view in range(len(self._given))]
 
+    def note_curvature(self, view: int, image: RenderedImage, weights: torch.Tensor) -> None:
+        """Add what a view's image tells of the loss's curvature.
+
+        Args:
+            view: Index of the view.
+            image: What its camera sees.
+            weights: (H, W, C) of the squares of residuals in the loss.
+        """
+        if self._moves:
+            self.curvature[view] += self.curvature_of(self.known(view), image, weights)
+
+    def curvature_of(self, camera: Camera, image: RenderedImage, weights: torch.Tensor) -> torch.Tensor:
+        """(6, 6) second derivatives of a weighted sum of squares by a motion of the world of one of these cameras."""
+        return pose_curvature(camera, image, weights, self._world)
+
     def step(self, views: Sequence[int], progress: float) -> None:
-        """One step of Adam with the gradients that have gathered.
+        """One step with the gradients and curvatures that have gathered.
 
         Args:
             views: Those that had a part in them.
@@ -135,12 +152,11 @@ class RefinedCameras:
             self._hold_still()
 
     def _move(self, rows: torch.Tensor, gradient: torch.Tensor, rate: float) -> None:
-        state = self._state
-        state["motion_steps"][rows] += 1
-        first, second = state["motion_first"][rows], state["motion_second"][rows]
-        steps = state["motion_steps"][rows]
-        self.motion[rows] += adam_of_poses(gradient[rows], first, second, steps, rate)
-        state["motion_first"][rows], state["motion_second"][rows] = first, second
+        known, found = self._state["motion_curvature"][rows], self.curvature[rows]
+        is_known = known.diagonal(dim1=1, dim2=2).sum(1) > 0
+        mean = torch.where(is_known[:, None, None], torch.lerp(found, known, _KEPT), found)
+        self._state["motion_curvature"][rows] = mean
+        self.motion[rows] += gauss_newton_steps(gradient[rows], mean, rate)
 
     def _hold_still(self) -> None:
         rows = self.motion[self._training]
@@ -167,7 +183,7 @@ class RefinedCameras:
         rows = self.motion.detach()[self._training]
         return {
             "rotation_degrees": math.degrees(float(rows[:, :3].norm(dim=1).mean())),
-            "translation": self._unit * float(rows[:, 3:].norm(dim=1).mean()),
+            "translation": self._world.unit * float(rows[:, 3:].norm(dim=1).mean()),
             "focal_factor": math.exp(float(self.lens.detach()[0])),
         }
 
@@ -184,26 +200,6 @@ def rotation_of(vector: torch.Tensor) -> torch.Tensor:
     one = torch.where(is_small, 1.0 - angle2 / 6.0, torch.sin(angle) / angle)
     two = torch.where(is_small, 0.5 - angle2 / 24.0, (1.0 - torch.cos(angle)) / (angle * angle))
     return torch.eye(3, dtype=vector.dtype) + one * skew + two * square
-
-
-def adam_of_poses(
-    gradient: torch.Tensor, first: torch.Tensor, second: torch.Tensor, steps: torch.Tensor, rate: float
-) -> torch.Tensor:
-    """(R, 6) steps of motions, whose rotation and translation have one second moment each; moments are updated.
-
-    Args:
-        gradient: (R, 6).
-        first: (R, 6) first moments.
-        second: (R, 2) second moments.
-        steps: (R, 1) steps done, this one included.
-        rate: Length of a step.
-    """
-    first.mul_(_BETAS[0]).add_(gradient, alpha=1.0 - _BETAS[0])
-    squares = gradient.reshape(-1, 2, 3).square().sum(-1)
-    second.mul_(_BETAS[1]).add_(squares, alpha=1.0 - _BETAS[1])
-    mean = first / (1.0 - _BETAS[0] ** steps)
-    size = (second / (1.0 - _BETAS[1] ** steps)).sqrt()
-    return -rate * mean / (size.repeat_interleave(3, dim=1) + _EPSILON)
 
 
 def _adam(

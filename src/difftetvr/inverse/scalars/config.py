@@ -61,6 +61,9 @@ class ScalarConfig(Schedule):
     """Learning rate in the last step; in between it falls log-linearly."""
     betas: tuple[float, float] = (0.9, 0.99)
     """Decay of Adam's first and second moments."""
+    total_variation: float = 1e-5
+    """Weight of the total variation of scalars, in ranges of the function and faces of a cube of the box's volume: what
+    images do not tell, such as where a function shows next to nothing, becomes flat."""
     knots: int = 32
     """Knots of a transfer function that is looked for."""
     function_rate: float = 1.0
@@ -92,6 +95,7 @@ class ScalarConfig(Schedule):
         for name in ("rate", "final_rate", "function_rate"):
             value = getattr(self, name)
             require(value > 0 and math.isfinite(value), name, value, "greater than 0 and finite")
+        require(0 <= self.total_variation < math.inf, "total_variation", self.total_variation, "at least 0 and finite")
         require(0 <= self.checkpoint_seconds < math.inf, "checkpoint_seconds", self.checkpoint_seconds, "at least 0")
         require(all(0 <= b < 1 for b in self.betas), "betas", self.betas, "at least 0 and less than 1")
         for name, kind in (("unknown", Unknown), ("refine", Refine)):

@@ -25,6 +25,7 @@ from difftetvr.inverse.scalars.config import ScalarConfig
 from difftetvr.inverse.scalars.scalars import Scalars
 from difftetvr.inverse.transfer.config import TransferConfig
 from difftetvr.inverse.transfer.knots import Knots
+from difftetvr.inverse.variation import total_variation
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.optics.transfer_function import TransferFunction
 from difftetvr.rendering import ScalarField, render
@@ -34,6 +35,8 @@ _FUNCTION = "function."  # prefix of the knots' state in a checkpoint
 _REACH = 0.1
 """Change of a scalar for which an image is taken to be linear in it; transfer functions bend."""
 _CANDIDATES, _CANDIDATE_VIEWS = 65, 4
+_ROUNDING = 0.1
+"""Gradient up to which the total variation is rounded off, in ranges per side of a cube of the box's volume."""
 
 
 class ScalarReconstruction(AdaptiveRun):
@@ -191,7 +194,20 @@ class ScalarReconstruction(AdaptiveRun):
         if self.knots is not None and hand_on is not None:
             self.knots.zero_grad()
             hand_on(None)
-        return [total, total]
+        return [total + self._penalise(mesh), total]
+
+    def _penalise(self, mesh: TetMesh) -> float:
+        """Adds the derivatives of the scalars' total variation; returns what it costs."""
+        weight, scalars = self.config.total_variation, self.scalars.values
+        if not weight or scalars.grad is None:
+            return 0.0
+        side = float((self.capture.bounds[1] - self.capture.bounds[0]).double().prod() ** (1.0 / 3.0))
+        found = total_variation(mesh, scalars.detach(), _ROUNDING / side)
+        weight /= side * side
+        scalars.grad += (weight * found.by_density).to(scalars)
+        if mesh.vertices.grad is not None:
+            mesh.vertices.grad += (weight * found.by_vertex).to(mesh.vertices)
+        return weight * float(found.value)
 
     def _error(self, mesh: TetMesh, field: ScalarField, view: int) -> torch.Tensor:
         """Mean squared error of a view."""

@@ -9,7 +9,6 @@ from . import objective as objective
 from . import reconstruction as reconstruction
 from . import scoring as scoring
 from . import solver as solver
-from . import variation as variation
 from .alignment import Alignment as Alignment
 from .config import TomographyConfig as TomographyConfig
 from .loop import TomographyResult as TomographyResult

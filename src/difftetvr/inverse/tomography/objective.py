@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 
 from difftetvr.inverse.tomography.config import Likelihood, TomographyConfig
-from difftetvr.inverse.tomography.variation import cell_weights, total_variation, weighted_square
+from difftetvr.inverse.variation import cell_weights, total_variation, weighted_square
 from difftetvr.mesh.tetmesh import TetMesh
 
 _ROUNDING = 1e-2

@@ -17,7 +17,7 @@ from difftetvr.inverse.tomography.densities import Densities
 from difftetvr.inverse.tomography.likelihoods import LIKELIHOODS
 from difftetvr.inverse.tomography.measurements import PixelSet
 from difftetvr.inverse.tomography.objective import Objective
-from difftetvr.inverse.tomography.variation import cell_weights, weighted_square
+from difftetvr.inverse.variation import cell_weights, weighted_square
 from difftetvr.mesh.field import Field
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.rendering import render

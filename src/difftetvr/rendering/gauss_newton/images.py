@@ -62,7 +62,8 @@ def model_image(
 
     Raises:
         MeshError: The field does not fit the mesh, lives on cells, or holds invalid values.
-        DiffTetError: The truth has another size than the camera's image, or an argument is out of range.
+        DiffTetError: The truth has another size than the camera's image, which has no pixels, or an argument is out of
+            range.
         BackendError: No back end runs on the device of the mesh.
     """
     options = ViewOptions(transmittance_threshold=transmittance_threshold, deterministic=deterministic)
@@ -71,7 +72,7 @@ def model_image(
     _require_shapes(view, mesh, truth, valid, face_steps)
     behind = as_background(background, mesh.vertices)
     backend = view.task.backend
-    tracer = view.tracer(view.limits(None))
+    tracer = view.tracer(view.limits)
     with backend.exclusive(deterministic):
         how = Composition(None if behind is None else backend.floats(behind), None, view.unit)
         rendered = render_forward(tracer, how)
@@ -174,6 +175,8 @@ def _require_shapes(
     if len(view.shape) != 2 or truth.shape != (*view.shape, 3):
         wanted = f"takes {(*view.shape, 3)}" if len(view.shape) == 2 else f"sees {view.shape}, which is no image"
         raise DiffTetError(f"The true image has shape {tuple(truth.shape)}; the camera {wanted}.")
+    if 0 in view.shape:
+        raise DiffTetError(f"The view has the shape {view.shape}, so it says nothing; pass one of a pixel at least.")
     if valid is not None and not (
         isinstance(valid, torch.Tensor) and valid.dtype == torch.bool and valid.shape == truth.shape[:2]
     ):

@@ -45,7 +45,7 @@ def model_line_integrals(
 
     Raises:
         MeshError: The densities do not fit the mesh, or are invalid.
-        DiffTetError: An argument has a wrong shape.
+        DiffTetError: An argument has a wrong shape, or there is no ray.
         BackendError: No back end runs on the device of the mesh.
     """
     topology = mesh.topology
@@ -54,8 +54,10 @@ def model_line_integrals(
     for shape, tensor in wanted:
         if tuple(tensor.shape) != tuple(shape):
             raise DiffTetError(f"A derivative or step has shape {tuple(tensor.shape)}; this view takes {tuple(shape)}.")
+    if 0 in view.shape:
+        raise DiffTetError(f"The view has the shape {view.shape}, so it says nothing; pass one of a ray at least.")
     backend = view.task.backend
-    tracer = view.tracer(view.limits(None))
+    tracer = view.tracer(view.limits)
     with backend.exclusive(deterministic):
         slopes, curvatures, steps = (
             backend.floats(part.reshape(-1)) for part in (*errors, face_steps.to(mesh.vertices) * view.unit)

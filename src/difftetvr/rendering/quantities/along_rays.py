@@ -66,11 +66,11 @@ def depth_at(
 
     def distances(view: PreparedView) -> torch.Tensor:
         depths = -torch.log(_of_each_ray(values, view, "transmittance"))
-        found = distances_at(view, view.limits(clip_plane), depths) * view.unit
+        found = distances_at(view, view.limits, depths) * view.unit
         return found if view.bundle is None else found + view.bundle.shift[:, None]
 
     options = ViewOptions(deterministic=deterministic, renderer=renderer)
-    return _of_views(lambda one: _looked(mesh, field, one, options, values, distances), camera, renderer)
+    return _of_views(lambda one: _looked(mesh, field, one, options, clip_plane, values, distances), camera, renderer)
 
 
 @eager
@@ -115,7 +115,7 @@ def transmittance_at(
         along, near = _of_each_ray(places, view, "distances"), torch.zeros((), dtype=torch.float64)
         if view.bundle is not None:
             along, near = along - view.bundle.shift[:, None], (view.bundle.near - view.bundle.shift)[:, None]
-        along, near, limits = along / view.unit, near.to(along) / view.unit, view.limits(clip_plane)
+        along, near, limits = along / view.unit, near.to(along) / view.unit, view.limits
         if limits is not None:
             # Distances do not pass the far end, so that it need not cut cells, and where it is has its derivatives.
             near, far = limits[:, :1], limits[:, 1:]
@@ -125,7 +125,9 @@ def transmittance_at(
         return torch.exp(-torch.where(along > near, depths, 0.0))
 
     options = ViewOptions(deterministic=deterministic, renderer=renderer)
-    return _of_views(lambda one: _looked(mesh, field, one, options, places, transmittances), camera, renderer)
+    return _of_views(
+        lambda one: _looked(mesh, field, one, options, clip_plane, places, transmittances), camera, renderer
+    )
 
 
 def _checked(values: Numbers, name: str) -> torch.Tensor:
@@ -137,11 +139,12 @@ def _looked(
     field: Any,
     camera: RaySource | Rays,
     options: ViewOptions,
+    clip_plane: Any,
     values: torch.Tensor,
     look: Callable[[PreparedView], torch.Tensor],
 ) -> torch.Tensor:
     """What a function of views has to say of one camera, (H, W) or (H, W, K), in the precision of the mesh."""
-    view = prepare_view(mesh, medium_of(mesh, field), camera, options)
+    view = prepare_view(mesh, medium_of(mesh, field), camera, options, clip_plane)
     shape = view.shape if values.dim() == 0 else (*view.shape, values.shape[-1])
     if 0 in shape:
         return view.empty(shape)

@@ -10,7 +10,7 @@ from torch.autograd.function import once_differentiable
 
 from difftetvr.memory import tried_twice
 from difftetvr.rendering.autograd import gradient_tensors
-from difftetvr.rendering.flags import flags_here, with_flags
+from difftetvr.rendering.kernels.flags import flags_here, with_flags
 from difftetvr.rendering.kernels.gradients import Wanted
 from difftetvr.rendering.kernels.profile import Table, Weighed, ask_depths, ask_distances, depths_adjoint
 from difftetvr.rendering.preparation import PreparedView

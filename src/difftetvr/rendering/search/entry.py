@@ -6,14 +6,14 @@ are looked for in a hierarchy. Where a ray starts inside the mesh, the cell that
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import drjit as dr
 
 from difftetvr.recording import few_lengths, replayed
 from difftetvr.rendering.search.hits import Hit
+from difftetvr.rendering.search.plan import Counts, Search, Told
 from difftetvr.rendering.search.scene import Scene
 
 
@@ -36,34 +36,7 @@ class EntryLists:
     is_simple: bool
 
 
-class EntrySearch(Protocol):
-    """Finds where rays enter a mesh."""
-
-    scene: Scene
-
-    def for_each(self, visit: Callable[[Hit], None], settle: Callable[[], Any]) -> None:
-        """Call ``visit`` for all half-faces that rays may enter through, ``settle`` after each kernel's worth."""
-        ...
-
-
-@dataclass
-class EntryCounts:
-    """How many entries there are.
-
-    Attributes:
-        count: (N,) those of each ray.
-        half_faces: (N,) one of them, which is all where no ray has more.
-        most: (1,) the greatest number.
-        total: (1,) the sum of the numbers.
-    """
-
-    count: Any
-    half_faces: Any
-    most: Any
-    total: Any
-
-
-def count_entries(search: EntrySearch, rays: int) -> EntryCounts:
+def count_entries(search: Search, rays: int) -> Counts:
     """Count the entries of N rays, for :func:`difftetvr.recording.replayed`."""
     uint = search.scene.backend.UInt
     count, half_faces = dr.zeros(uint, rays), dr.zeros(uint, rays)
@@ -73,46 +46,26 @@ def count_entries(search: EntrySearch, rays: int) -> EntryCounts:
         dr.scatter(half_faces, hit.half_face, hit.pixel, hit.is_hit)
 
     search.for_each(visit, lambda: dr.eval(count, half_faces))
-    # Of no rays there is no maximum.
-    most, total = (dr.max(count), dr.sum(count)) if rays else (dr.zeros(uint, 1), dr.zeros(uint, 1))
-    dr.eval(most, total)
-    return EntryCounts(count, half_faces, most, total)
+    return Counts.of(count, half_faces)
 
 
-def list_entries(search: EntrySearch, counts: EntryCounts, most: int, total: int, has_starts: bool) -> EntryLists:
+def list_entries(search: Search, counts: Counts, told: Told, has_starts: bool) -> EntryLists:
     """Entry lists of every ray of a view.
 
     Args:
         search: Finds them.
         counts: How many there are.
-        most: The greatest number of entries of a ray.
-        total: Number of all entries.
+        told: What the host knows of that.
         has_starts: Whether rays may start inside the mesh.
     """
     rays = search.scene.rays.count
-    if most <= 1:
+    if told.most <= 1:
         return EntryLists(search.scene.backend.lanes(rays), counts.count, counts.half_faces, has_starts, True)
-    offset, half_faces = replayed(_fill, search, counts.count, few_lengths(total), rays)
+    offset, half_faces = replayed(_fill, search, counts.count, few_lengths(told.total), rays)
     return EntryLists(offset, counts.count, half_faces, has_starts, False)
 
 
-def find_entries(search: EntrySearch, has_starts: bool) -> EntryLists:
-    """Count and list the entries of every ray."""
-    counts, ends = replayed(_counts_and_ends, search, search.scene.rays.count)
-    most, total = ends.numpy().tolist()
-    return list_entries(search, counts, most, total, has_starts)
-
-
-def _counts_and_ends(search: EntrySearch, rays: int) -> tuple[EntryCounts, Any]:
-    """The counts, and (2,) the greatest number and the sum of all, for a host that waits for nothing else."""
-    counts, backend = count_entries(search, rays), search.scene.backend
-    ends = dr.empty(backend.UInt, 2)
-    dr.scatter(ends, backend.UInt2(counts.most, counts.total), backend.UInt(0))
-    dr.eval(ends)
-    return counts, ends
-
-
-def _fill(search: EntrySearch, count: Any, total: int, rays: int) -> tuple[Any, Any]:
+def _fill(search: Search, count: Any, total: int, rays: int) -> tuple[Any, Any]:
     """Where each ray's list starts, and the lists."""
     uint, real = search.scene.backend.UInt, search.scene.backend.Float
     offset = dr.prefix_sum(count)

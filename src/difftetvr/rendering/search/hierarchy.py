@@ -18,12 +18,16 @@ import torch
 from difftetvr.backend import Backend
 from difftetvr.mesh.arrays import chunks
 from difftetvr.mesh.topology.topology import Topology
-from difftetvr.rendering.traversal.rays import Frame, rounding_of
+from difftetvr.rendering.search.scene import Cells
+from difftetvr.rendering.traversal.rays import Frame, largest_coordinate, rounding_of
 
 CELLS_OF_A_LEAF = 2
 """Searches among cells are slower with one or with four."""
 
 _CURVE_BITS = 20  # of each coordinate
+
+_LEVELS = 3
+"""Levels of a hierarchy that a kernel makes of the one below them."""
 
 
 @dataclass(frozen=True)
@@ -45,10 +49,63 @@ class SortedItems:
         return SortedItems(items[order].to(torch.int32), corners[order].to(torch.int32))
 
 
-def sorted_cells(topology: Topology, vertices: torch.Tensor) -> SortedItems:
+@dataclass
+class Leaves:
+    """Items of a hierarchy as kernels of any precision read them, wherever they are.
+
+    Attributes:
+        items: (N,) numbers of the items, those of a leaf next to each other.
+        corners: Flat (N, K) vertices.
+        width: K.
+        count: N, as a device value.
+        leaf_items: How many items a leaf has.
+        level: Binary logarithm of the number L of leaves.
+        leaf: (L,) numbers of the leaves, of which the last may have no items.
+        above: Numbers of the nodes of each level above the leaves for which there is a kernel.
+        first: L, as a device value.
+    """
+
+    items: Any
+    corners: Any
+    width: int
+    count: Any
+    leaf_items: int
+    level: int
+    leaf: Any
+    above: list[Any]
+    first: Any
+
+    @staticmethod
+    def of(backend: Backend, sorted_items: SortedItems, leaf_items: int) -> Leaves:
+        """Upload items, so many for each leaf: one for speed, several for less memory."""
+        count, width = sorted_items.corners.shape
+        level = max(0, -(-count // leaf_items) - 1).bit_length()
+        return Leaves(
+            backend.uints(sorted_items.items),
+            backend.uints(sorted_items.corners),
+            width,
+            backend.constant(count),
+            leaf_items,
+            level,
+            backend.lanes(1 << level),
+            [backend.lanes(1 << above) for above in _levels_above(level)],
+            backend.constant(1 << level),
+        )
+
+
+def _levels_above(level: int) -> list[int]:
+    """Levels at which kernels start that make boxes, from below: each makes its own and those on the way there."""
+    return [max(above, 0) for above in range(level - _LEVELS, -_LEVELS, -_LEVELS)]
+
+
+def leaves_of_cells(backend: Backend, topology: Topology, vertices: Callable[[], torch.Tensor]) -> Leaves:
     """All cells of a mesh, sorted by where they are among (V, 3) vertices the first time."""
-    cells = torch.arange(topology.num_cells, device=topology.tets.device)
-    return topology.cached("hierarchy.cells", lambda: SortedItems.of(cells, topology.tets, vertices.detach()))
+
+    def build() -> Leaves:
+        cells = torch.arange(topology.num_cells, device=topology.tets.device)
+        return Leaves.of(backend, SortedItems.of(cells, topology.tets, vertices().detach()), CELLS_OF_A_LEAF)
+
+    return topology.cached(f"hierarchy.cells.{backend.name}", build)
 
 
 @dataclass
@@ -57,53 +114,34 @@ class Hierarchy:
 
     Attributes:
         backend: Array types.
+        leaves: The items.
         boxes: (2 L, 8) least and negated greatest coordinates of each node, and two of padding; infinite where it has
             no items.
-        items: (N,) numbers of the items, those of a leaf next to each other.
-        count: N, as a device value.
-        leaves: L, as a device value.
-        leaf_items: How many items a leaf has.
-        size: Greatest coordinate of any box, as a device value.
     """
 
     backend: Backend
+    leaves: Leaves
     boxes: Any
-    items: Any
-    count: Any
-    leaves: Any
-    leaf_items: int
-    size: Any
 
     @staticmethod
-    def over(backend: Backend, sorted_items: SortedItems, vertices: torch.Tensor, leaf_items: int) -> Hierarchy:
-        """Build the boxes of items.
+    def over(leaves: Leaves, cells: Cells) -> Hierarchy:
+        """Build the boxes of items with vertices of some cells, in their precision; may be recorded."""
+        backend = cells.backend
+        boxes, below = (dr.empty(backend.Float, size << leaves.level) for size in (16, 8))
+        box = _leaf_boxes(leaves, cells)
+        _store(backend, below, leaves.leaf, box)
+        _store(backend, boxes, leaves.first + leaves.leaf, box)
+        dr.eval(boxes, below)
+        level = leaves.level
+        for above, node in zip(_levels_above(level), leaves.above, strict=True):
+            below, level = _raised(backend, boxes, below, node, (level, above)), above
+        return Hierarchy(backend, leaves, boxes)
 
-        Args:
-            backend: Back end of the vertices' device and precision.
-            sorted_items: The items.
-            vertices: (V, 3) positions.
-            leaf_items: Items in a leaf: one for speed, several for less memory.
-        """
-        count = sorted_items.items.shape[0]
-        used = -(-count // leaf_items)
-        leaves = 1 << max(0, (used - 1).bit_length())
-        boxes = torch.full((2 * leaves, 8), torch.inf, dtype=backend.dtype, device=backend.device)
-        boxes[leaves : leaves + used] = _leaf_boxes(backend, sorted_items, vertices, leaf_items)
-        level = leaves
-        while level > 1:
-            torch.minimum(boxes[level : 2 * level : 2], boxes[level + 1 : 2 * level : 2], out=boxes[level // 2 : level])
-            level //= 2
-        hierarchy = Hierarchy(
-            backend,
-            backend.floats(boxes),
-            backend.uints(sorted_items.items),
-            backend.opaque_uint(count),
-            backend.opaque_uint(leaves),
-            leaf_items,
-            backend.floats(boxes[1, :6].abs().amax()[None]),
-        )
-        backend.run(hierarchy.boxes, hierarchy.items, hierarchy.size)
-        return hierarchy
+    @property
+    def size(self) -> Any:
+        """Greatest coordinate of any box."""
+        low, high = _box(self.backend, self.boxes, self.backend.UInt(1))
+        return largest_coordinate([low, high])
 
     def meet_lines(
         self, frame: Frame, near: Any, far: Any, active: Any, visit: Callable[[Any, Any, Any], Any], state: Any
@@ -175,25 +213,25 @@ class Hierarchy:
         state: Any,
         is_done: Callable[[Any], Any] | None = None,
     ) -> Any:
-        uint, float4 = self.backend.UInt, self.backend.Float4
+        leaves, backend = self.leaves, self.backend
+        uint, count = backend.UInt, leaves.leaf_items
 
         def at_item(place: Any, state: Any) -> tuple[Any, Any]:
-            is_there = place < self.count
-            return place + 1, visit(dr.gather(uint, self.items, place, is_there), is_there, state)
+            is_there = place < leaves.count
+            return place + 1, visit(dr.gather(uint, leaves.items, place, is_there), is_there, state)
 
         def at_leaf(node: Any, state: Any) -> Any:
-            first = (node - self.leaves) * self.leaf_items
-            if self.leaf_items == 1:
+            first = (node - leaves.first) * count
+            if count == 1:
                 return at_item(first, state)[1]
-            end = first + self.leaf_items
+            end = first + count
             return dr.while_loop((first, state), lambda place, _: place < end, at_item)[1]
 
         def body(node: Any, state: Any) -> tuple[Any, Any]:
-            first, second = (dr.gather(float4, self.boxes, 2 * node + k) for k in range(2))
-            low, high = [first[0], first[1], first[2]], [-first[3], -second[0], -second[1]]
+            low, high = _box(backend, self.boxes, node)
             center = [0.5 * (a + b) for a, b in zip(low, high, strict=True)]
             is_met = test(center, [0.5 * (b - a) for a, b in zip(low, high, strict=True)])
-            is_leaf = node >= self.leaves
+            is_leaf = node >= leaves.first
             state = dr.if_stmt((node, state), is_met & is_leaf, at_leaf, lambda _, state: state)
             behind = node + 1
             behind >>= dr.tzcnt(behind)
@@ -234,21 +272,60 @@ def _spread(values: torch.Tensor) -> torch.Tensor:
     return (values | (values << 2)) & 0x1249249249249249
 
 
-def _leaf_boxes(backend: Backend, sorted_items: SortedItems, vertices: torch.Tensor, leaf_items: int) -> torch.Tensor:
-    """(L, 8) least and negated greatest coordinates of the leaves that have items, and padding."""
-    uint, real = backend.UInt, backend.Float
-    positions, corners = backend.floats(vertices), backend.uints(sorted_items.corners)
-    count, width = sorted_items.corners.shape
-    leaf, last = dr.arange(uint, -(-count // leaf_items)), backend.opaque_uint(count - 1)
-    ends = [real(dr.inf) for _ in range(6)]
-    for k in range(leaf_items):
-        item = leaf_items * leaf + k
-        item = dr.select(item < last, item, last)
-        for column in range(width):
-            vertex = dr.gather(uint, corners, width * item + column)
-            point = [dr.gather(real, positions, 3 * vertex + axis) for axis in range(3)]
-            ends = [dr.fmin(a, b) for a, b in zip(ends, [*point, *(-x for x in point)], strict=True)]
-    boxes = dr.empty(real, 8 * dr.width(leaf))
-    dr.scatter(boxes, backend.Float4(*ends[:4]), 2 * leaf)
-    dr.scatter(boxes, backend.Float4(*ends[4:], 0, 0), 2 * leaf + 1)
-    return backend.tensor(boxes, -1, 8)
+def _box(backend: Backend, boxes: Any, node: Any) -> tuple[list[Any], list[Any]]:
+    """Least and greatest coordinates of a node."""
+    first, second = (dr.gather(backend.Float4, boxes, 2 * node + k) for k in range(2))
+    return [first[0], first[1], first[2]], [-first[3], -second[0], -second[1]]
+
+
+def _store(backend: Backend, boxes: Any, node: Any, ends: list[Any]) -> None:
+    """Write least and negated greatest coordinates of a node."""
+    dr.scatter(boxes, backend.Float4(*ends[:4]), 2 * node)
+    dr.scatter(boxes, backend.Float4(*ends[4:], 0, 0), 2 * node + 1)
+
+
+def _leaf_boxes(leaves: Leaves, cells: Cells) -> list[Any]:
+    """Least and negated greatest coordinates of the leaves."""
+    uint = cells.backend.UInt
+    ends = [cells.backend.Float(dr.inf) for _ in range(6)]
+    for k in range(leaves.leaf_items):
+        item = leaves.leaf_items * leaves.leaf + k
+        is_there = item < leaves.count
+        for column in range(leaves.width):
+            point = cells.point(dr.gather(uint, leaves.corners, leaves.width * item + column, is_there), is_there)
+            corner = (*point, *(-x for x in point))
+            ends = [dr.fmin(a, dr.select(is_there, b, dr.inf)) for a, b in zip(ends, corner, strict=True)]
+    return ends
+
+
+def _raised(backend: Backend, boxes: Any, below: Any, node: Any, levels: tuple[int, int]) -> Any:
+    """Write the boxes of all levels from one to another further up, of those of the first; returns those of the last.
+
+    Args:
+        backend: Array types.
+        boxes: All boxes.
+        below: Those of the nodes of the first level.
+        node: Numbers of the nodes of the last level.
+        levels: These two.
+    """
+    level, last = levels
+    ends = _children(backend, below, node, 1 << (level - last))
+    while level > last:
+        level -= 1
+        ends = [[dr.fmin(a, b) for a, b in zip(*pair, strict=True)] for pair in zip(ends[::2], ends[1::2], strict=True)]
+        first = (1 << level) + (node << (level - last))
+        for k, box in enumerate(ends):
+            _store(backend, boxes, first + k, box)
+    top = dr.empty(backend.Float, 8 << last)
+    _store(backend, top, node, ends[0])
+    dr.eval(boxes, top)
+    return top
+
+
+def _children(backend: Backend, below: Any, node: Any, count: int) -> list[list[Any]]:
+    """The boxes of the nodes below others, ``count`` of each."""
+    found = []
+    for k in range(count):
+        first, second = (dr.gather(backend.Float4, below, 2 * (count * node + k) + half) for half in range(2))
+        found.append([first[0], first[1], first[2], first[3], second[0], second[1]])
+    return found

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,3 +24,10 @@ class Hit:
     half_face: Any
     depth: Any
     is_hit: Any
+
+
+Visit = Callable[[Hit], None]
+"""Takes a hit."""
+
+Settle = Callable[[], Any]
+"""Is called after each kernel's worth of hits."""

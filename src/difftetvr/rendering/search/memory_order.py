@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import drjit as dr
 import torch
 
 from difftetvr.backend import Backend
@@ -61,6 +62,7 @@ class MeshTables:
     Attributes:
         vertices: (V,) the mesh's number of each vertex.
         cells: (T,) the mesh's number of each cell.
+        numbers: (T,) their numbers in this order.
         tets: (T, 4) vertices.
         adjacency: (T, 4) cells behind the half-faces.
         walk: See :func:`difftetvr.rendering.traversal.walk.walk_table`.
@@ -70,6 +72,7 @@ class MeshTables:
 
     vertices: Any
     cells: Any
+    numbers: Any
     tets: Any
     adjacency: Any | None
     walk: Any | None
@@ -81,43 +84,16 @@ class MeshTables:
         """Upload a topology."""
         topology = order.topology
         vertices, cells, tets = (backend.uints(table) for table in (order.vertices, order.cells, topology.tets))
+        numbers = dr.arange(backend.UInt, topology.num_cells)
+        dr.make_opaque(numbers)
         if not topology.is_conforming:
-            return MeshTables(vertices, cells, tets, None, None, None, 0)
+            return MeshTables(vertices, cells, numbers, tets, None, None, None, 0)
         boundary = boundary_half_faces(topology)
         faces = few_lengths(boundary.shape[0])
         padded = torch.nn.functional.pad(boundary, (0, faces - boundary.shape[0]), value=NONE - (1 << 32))
         joined = (backend.uints(table) for table in (topology.cell_adjacency, walk_table(topology), padded))
         adjacency, walk, faces_of_boundary = joined
-        return MeshTables(vertices, cells, tets, adjacency, walk, faces_of_boundary, faces)
-
-
-@dataclass
-class OrderedMesh:
-    """A mesh in the order of memory, seen from where rays are.
-
-    Attributes:
-        backend: Array types.
-        order: The order.
-        tables: What kernels read of the topology.
-        records: Flat records of vertices, which begin with x, y and z in the space of the rays.
-        stride: Packets of four floats a record.
-        extent: Greatest of x, -x, y, -y, z and -z among them, and two numbers more; on the device.
-        largest: Greatest absolute coordinate; None as long as the host does not know it.
-    """
-
-    backend: Backend
-    order: MemoryOrder
-    tables: MeshTables
-    records: Any
-    stride: int
-    extent: Any
-    largest: float | None
-
-    @property
-    def positions(self) -> torch.Tensor:
-        """(V, 3) vertices in the space of the rays."""
-        rows = self.backend.tensor(self.records, -1, 4 * self.stride)
-        return rows[: self.order.topology.num_vertices, :3]
+        return MeshTables(vertices, cells, numbers, tets, adjacency, walk, faces_of_boundary, faces)
 
 
 def _ordered(mesh: TetMesh) -> MemoryOrder:

@@ -8,15 +8,14 @@ and of several paths that end and begin at the origin some may seem to span it; 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 
 from difftetvr.mesh.topology.topology import LOCAL_FACES
-from difftetvr.recording import few_lengths, replayed
-from difftetvr.rendering.search.hits import Hit
+from difftetvr.rendering.search.hits import Hit, Visit
+from difftetvr.rendering.search.plan import Around
 from difftetvr.rendering.search.scene import Scene
 from difftetvr.rendering.traversal.rays import Lanes, rounding_of
 from difftetvr.rendering.traversal.walk import BOUNDARY, crossing_depth, find_exit
@@ -49,7 +48,7 @@ class StartSearch:
     lane: Any
     near: Any
 
-    def look_at(self, cell: Any, active: Any, visit: Callable[[Hit], None]) -> None:
+    def look_at(self, cell: Any, active: Any, visit: Visit) -> None:
         """Call ``visit`` with the half-face through which a cell is entered, a hit if the ray starts there."""
         is_crossed, half_face = self.scene.entered(self.rays.frame, cell, active)
 
@@ -94,37 +93,17 @@ def _rounding(face: Any) -> Any:
     return 16.0 * dr.epsilon(size) * size
 
 
-def for_each_start_among(search: StartSearch, starts: PointStarts, visit: Callable[[Hit], None]) -> None:
+def for_each_start_among(search: StartSearch, around: Around, visit: Visit) -> None:
     """Call ``visit`` for all of some cells in which rays start."""
     uint = search.scene.backend.UInt
-    count = dr.gather(uint, starts.count, uint(0))
+    count, room = dr.gather(uint, around.count, uint(0)), dr.width(around.cells)
+    count = dr.select(count < room, count, room)
 
     def body(index: Any) -> tuple[Any]:
-        search.look_at(dr.gather(uint, starts.cells, index), search.rays.valid, visit)
+        search.look_at(dr.gather(uint, around.cells, index), search.rays.valid, visit)
         return (index + 1,)
 
     dr.while_loop((dr.zeros(uint, dr.width(search.lane)),), lambda index: index < count, body)
-
-
-@dataclass
-class PointStarts:
-    """Cells in which rays that begin at one point may start.
-
-    Attributes:
-        cells: (capacity,) the cells around it, in any order.
-        count: (1,) their number, which may be greater than the capacity.
-        adjacency: Flat (T, 4) cells behind the half-faces.
-        lane: Numbers of all lanes.
-    """
-
-    cells: Any
-    count: Any
-    adjacency: Any
-    lane: Any
-
-    def search(self, scene: Scene, rays: Lanes, near: Any) -> StartSearch:
-        """What tells in which of them each ray starts."""
-        return StartSearch(scene, self.adjacency, rays, self.lane, near)
 
 
 def reach_of_beginnings(scene: Scene, lane: Any, limits: Any) -> Any:
@@ -151,7 +130,7 @@ def reach_of_beginnings(scene: Scene, lane: Any, limits: Any) -> Any:
     return reach
 
 
-def cells_around(scene: Scene, cell: Any, extent: Any, capacity: int, reach: Any | None) -> tuple[Any, Any]:
+def cells_around(scene: Scene, cell: Any, extent: Any, capacity: int, reach: Any | None) -> Around:
     """Cells that may hold the point where rays begin: it lies in them or very near.
 
     Args:
@@ -160,9 +139,6 @@ def cells_around(scene: Scene, cell: Any, extent: Any, capacity: int, reach: Any
         extent: Greatest of x, -x, y, -y, z and -z of any vertex: most cameras look at the mesh from outside.
         capacity: How many cells there is room for.
         reach: Of the point, likewise, as far as rounding lets it; None for the origin, where a camera is.
-
-    Returns:
-        (capacity,) the cells, in any order, and (1,) their number.
     """
     backend, uint, real = scene.backend, scene.backend.UInt, scene.backend.Float
     ends = [real(0) if reach is None else dr.gather(real, reach, uint(k)) for k in range(6)]
@@ -191,18 +167,7 @@ def cells_around(scene: Scene, cell: Any, extent: Any, capacity: int, reach: Any
     place: Any = dr.scatter_inc(used, uint(0), around)
     dr.scatter(found, cell, place, around & (place < capacity))
     dr.eval(found, used)
-    return found, used
-
-
-def find_cells_around(
-    scene: Scene, cell: Any, extent: Any, reach: Any | None = None, capacity: int = AROUND
-) -> tuple[Any, Any, int]:
-    """All cells that may hold a point, their number, and the same on the host; see :func:`cells_around`."""
-    cells, used = replayed(cells_around, scene, cell, extent, capacity, reach)
-    count = int(used[0])
-    if count > capacity:
-        return find_cells_around(scene, cell, extent, reach, few_lengths(count))
-    return cells, used, count
+    return Around(found, used)
 
 
 def _triple(p: list[Any], q: list[Any], r: list[Any]) -> Any:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
+
+import torch
 
 from difftetvr.mesh import TetMesh
-from difftetvr.rendering.search.entry import EntryLists
-from difftetvr.rendering.search.memory_order import OrderedMesh
+from difftetvr.rendering.search.memory_order import MemoryOrder, MeshTables
 from difftetvr.rendering.search.scene import Scene
 from difftetvr.rendering.traversal.crossing import View
 
@@ -18,13 +20,27 @@ class Aim:
     Attributes:
         view: What kernels read.
         scene: The cells in the space of the rays.
-        ordered: The mesh in the order of memory, in that space.
         mesh: The mesh as it was passed.
-        entries: Where rays enter the mesh, if that is known already.
+        found: What the tracer's plan has found: where rays enter the mesh, their fragments, or nothing.
     """
 
     view: View
     scene: Scene
-    ordered: OrderedMesh
     mesh: TetMesh
-    entries: EntryLists | None
+    found: Any
+
+    @property
+    def order(self) -> MemoryOrder:
+        """The order of the mesh in memory."""
+        return MemoryOrder.of(self.mesh)
+
+    @property
+    def tables(self) -> MeshTables:
+        """What kernels read of the topology."""
+        return self.order.tables(self.view.backend)
+
+    @property
+    def positions(self) -> torch.Tensor:
+        """(V, 3) vertices in the space of the rays, in the order of memory."""
+        rows = self.view.backend.tensor(self.scene.vertices, -1, 4 * self.scene.stride)
+        return rows[: self.mesh.num_vertices, :3]

@@ -11,19 +11,215 @@ from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
-import torch
 
-from difftetvr.rendering.search.bundle_hits import BundleSearch
-from difftetvr.rendering.search.hits import Hit
+from difftetvr.backend import Backend
+from difftetvr.mesh import TetMesh
+from difftetvr.recording import few_lengths
+from difftetvr.rendering.search.bundle_hits import Stretches
+from difftetvr.rendering.search.hierarchy import Hierarchy, Leaves, leaves_of_cells
+from difftetvr.rendering.search.hits import Hit, Settle, Visit
+from difftetvr.rendering.search.memory_order import MemoryOrder, MeshTables
+from difftetvr.rendering.search.plan import Around, Counts, Found, Search, Told
 from difftetvr.rendering.search.rasterise import for_each_hit, work_items, workers_for
-from difftetvr.rendering.search.scene import NONE
-from difftetvr.rendering.search.starts import find_cells_around
-from difftetvr.rendering.tracers.aim import Aim
-from difftetvr.rendering.tracers.bands import Band
-from difftetvr.rendering.traversal.bundle import BundleRays
+from difftetvr.rendering.search.scene import NONE, Scene
+from difftetvr.rendering.search.starts import AROUND, cells_around
+from difftetvr.rendering.traversal.rays import ImageRays
 from difftetvr.rendering.traversal.walk import crossing_depth, find_exit, holds_ray
 
 _FACES_AT_A_TIME = 1 << 22  # bounds the memory of work items
+
+
+@dataclass
+class Fragments:
+    """What is known of the fragments of a view.
+
+    Attributes:
+        search: Finds them.
+        count: (lanes,) number of fragments of each lane: its depth complexity.
+        longest: The greatest of them.
+        total: Their sum.
+        starts_inside: Whether some crossings begin behind the camera.
+    """
+
+    search: Search
+    count: Any
+    longest: int
+    total: int
+    starts_inside: bool
+
+
+@dataclass
+class CameraFragments:
+    """Plans to find the fragments of a camera's rays.
+
+    Attributes:
+        lane: Numbers of the lanes that have rays.
+        worker: Those of the lanes that rasterise.
+        half_face: Numbers of half-faces, as many as are rasterised at a time.
+        lengths: Those of ``worker`` and ``half_face``.
+        firsts: What to add to them, each time.
+        end: Number of all half-faces, as a device value.
+        cell: Numbers of all cells.
+        capacity: Cells around the camera that there is room for.
+        sees_all: See :class:`difftetvr.rendering.search.plan.SearchPlan`.
+    """
+
+    lane: Any
+    worker: Any
+    half_face: Any
+    lengths: tuple[int, int]
+    firsts: list[Any]
+    end: Any
+    cell: Any
+    capacity: int = AROUND
+    sees_all: Any | None = None
+
+    @staticmethod
+    def of(backend: Backend, tables: MeshTables, rays: ImageRays) -> CameraFragments:
+        """Plan for a mesh."""
+        end = 4 * dr.width(tables.numbers)
+        at_a_time = min(few_lengths(end), _FACES_AT_A_TIME)
+        lengths = workers_for(at_a_time, rays.count), at_a_time
+        lane, worker, half_face = (backend.lanes(size) for size in (rays.lane_count, *lengths))
+        firsts = [backend.constant(first) for first in range(0, end, at_a_time)]
+        return CameraFragments(lane, worker, half_face, lengths, firsts, backend.constant(end), tables.numbers)
+
+    def find(self, scene: Scene, extent: Any) -> Found:
+        """See :meth:`difftetvr.rendering.search.plan.SearchPlan.find`."""
+        around = cells_around(scene, self.cell, extent, self.capacity, None)
+        return Found(_counted(_CameraFragmentSearch(scene, self, around)), around, [])
+
+    def settled(self, scene: Scene, found: Found, told: Told) -> Fragments:
+        """See :meth:`difftetvr.rendering.search.plan.SearchPlan.settled`."""
+        assert found.around is not None
+        search = _CameraFragmentSearch(scene, self, found.around)
+        return Fragments(search, found.counts.count, told.most, told.total, told.around > 0)
+
+
+@dataclass
+class _CameraFragmentSearch:
+    """All half-faces in front of a camera, and the cells around it."""
+
+    scene: Scene
+    plan: CameraFragments
+    around: Around
+
+    def for_each(self, visit: Visit, settle: Settle) -> None:
+        scene, plan = self.scene, self.plan
+        for first in plan.firsts:
+            half_face = plan.half_face + first
+            items = work_items(scene, dr.select(half_face < plan.end, half_face, NONE), plan.worker)
+            for_each_hit(scene, items, visit)
+            settle()
+        self._for_each_around(visit)
+        settle()
+
+    def _for_each_around(self, visit: Visit) -> None:
+        """Crossings of cells that hold the camera: they begin behind it, where no face is rasterised."""
+        scene, uint, lane, room = self.scene, self.scene.backend.UInt, self.plan.lane, self.plan.capacity
+        rays, count = scene.rays.of_lanes(lane), dr.gather(uint, self.around.count, uint(0))
+        count = 4 * dr.select(count < room, count, room)
+
+        def body(index: Any) -> tuple[Any]:
+            half_face = 4 * dr.gather(uint, self.around.cells, index >> 2) + (index & 3)
+            face, apex = scene.face_and_apex(rays.frame, half_face)
+            depth, exit_depth = crossing_depth(face), crossing_depth(find_exit(face, apex).face(face, apex))
+            is_hit = rays.valid & holds_ray(face) & (depth <= 0) & (exit_depth > 0)
+            visit(Hit(rays.pixel, lane, half_face, depth, is_hit))
+            return (index + 1,)
+
+        dr.while_loop((dr.zeros(uint, dr.width(lane)),), lambda index: index < count, body)
+
+
+@dataclass
+class BundleFragments:
+    """Plans to find the fragments of a bundle's rays.
+
+    Attributes:
+        stretches: What is looked at.
+        cells: All cells.
+        capacity: See :class:`difftetvr.rendering.search.plan.SearchPlan`.
+    """
+
+    stretches: Stretches
+    cells: Leaves
+    capacity: int = 0
+
+    @staticmethod
+    def of(backend: Backend, mesh: TetMesh, stretches: Stretches) -> BundleFragments:
+        """Plan for a mesh."""
+        order = MemoryOrder.of(mesh)
+        return BundleFragments(stretches, leaves_of_cells(backend, order.topology, lambda: order.mesh(mesh).vertices))
+
+    @property
+    def sees_all(self) -> Any | None:
+        """See :class:`difftetvr.rendering.search.plan.SearchPlan`."""
+        return self.stretches.sees_all
+
+    def find(self, scene: Scene, extent: Any) -> Found:
+        """See :meth:`difftetvr.rendering.search.plan.SearchPlan.find`."""
+        cells = Hierarchy.over(self.cells, scene)
+        return Found(_counted(_BundleFragmentSearch(scene, self, cells)), None, [cells.boxes])
+
+    def settled(self, scene: Scene, found: Found, told: Told) -> Fragments:
+        """See :meth:`difftetvr.rendering.search.plan.SearchPlan.settled`."""
+        search = _BundleFragmentSearch(scene, self, Hierarchy(scene.backend, self.cells, found.boxes[0]))
+        return Fragments(search, found.counts.count, told.most, told.total, False)
+
+
+@dataclass
+class _BundleFragmentSearch:
+    """All cells that may lie along a bundle."""
+
+    scene: Scene
+    plan: BundleFragments
+    cells: Hierarchy
+
+    def for_each(self, visit: Visit, settle: Settle) -> None:
+        scene, lane = self.scene, self.plan.stretches.lane
+        rays, near, far = self.plan.stretches.seen(scene)
+
+        def at_cell(cell: Any, active: Any, state: Any) -> Any:
+            is_crossed, half_face = scene.entered(rays.frame, cell, active)
+
+            def crossed(state: Any) -> Any:
+                face, apex = scene.face_and_apex(rays.frame, half_face)
+                exit_depth = crossing_depth(find_exit(face, apex).face(face, apex))
+                depth = crossing_depth(face)
+                is_hit = (exit_depth > near) & (depth < far)
+                visit(Hit(rays.pixel, lane, half_face, depth, is_hit))
+                return state
+
+            return dr.if_stmt((state,), is_crossed, crossed, lambda state: state)
+
+        self.cells.meet_lines(rays.frame, near, far, rays.valid, at_cell, lane)
+        settle()
+
+
+def _counted(search: Search) -> Counts:
+    """Number of fragments of each lane."""
+    uint, lanes = search.scene.backend.UInt, search.scene.rays.lane_count
+    count = dr.zeros(uint, lanes)
+    search.for_each(lambda hit: dr.scatter_add(count, uint(1), hit.lane, hit.is_hit), lambda: dr.eval(count))
+    return Counts.of(count, None)
+
+
+@dataclass
+class FragmentBand:
+    """Lanes whose lists are held at a time.
+
+    Attributes:
+        lane: Their numbers.
+        first, last: The first, and the one behind the last, as device values.
+        count: How many there are.
+        size: Fragments that there is room for.
+    """
+
+    lane: Any
+    first: Any
+    last: Any
+    count: int
+    size: int
 
 
 @dataclass
@@ -42,92 +238,24 @@ class FragmentLists:
     faces: Any
     depths: Any
 
-
-class FragmentRaster:
-    """Finds the fragments of a view."""
-
-    def __init__(self, aim: Aim) -> None:
-        """Take a view."""
-        self.scene, backend = aim.scene, aim.scene.backend
-        self.half_faces = 4 * aim.ordered.order.topology.num_cells
-        self.bundle, self.around, self.around_count = None, None, 0
-        if isinstance(self.scene.rays, BundleRays):
-            self.bundle = BundleSearch.for_fragments(self.scene, aim.ordered, aim.view.limits)
-            return
-        cells = backend.lanes(self.half_faces // 4)
-        self.around, _, self.around_count = find_cells_around(self.scene, cells, aim.ordered.extent)
-
-    @property
-    def starts_inside(self) -> bool:
-        """Whether some crossings begin behind the camera."""
-        return self.around_count > 0
-
-    def count(self) -> torch.Tensor:
-        """(lanes,) int64 number of fragments of each lane: its depth complexity."""
-        uint = self.scene.backend.UInt
-        counts = dr.zeros(uint, self.scene.rays.lane_count)
-
-        def add(hit: Hit) -> None:
-            dr.scatter_add(counts, uint(1), hit.lane, hit.is_hit)
-
-        self._for_each(add, counts)
-        return self.scene.backend.tensor(self.scene.backend.Int(counts)).long()
-
-    def lists(self, band: Band) -> FragmentLists:
-        """Push the fragments of a band's pixels to their lists."""
-        backend = self.scene.backend
-        uint, size = backend.UInt, max(band.total, 1)
+    @staticmethod
+    def of(search: Search, band: FragmentBand) -> FragmentLists:
+        """Push the fragments of a band's lanes to their lists; may be recorded."""
+        backend = search.scene.backend
+        uint, size = backend.UInt, band.size
         lists = FragmentLists(
-            dr.full(uint, NONE, band.last - band.first),
-            dr.empty(uint, size),
-            dr.empty(uint, size),
-            dr.empty(backend.Float, size),
+            dr.full(uint, NONE, band.count), dr.empty(uint, size), dr.empty(uint, size), dr.empty(backend.Float, size)
         )
         used = dr.zeros(uint, 1)
-        first, last = backend.opaque_uint(band.first), backend.opaque_uint(band.last)
 
         def push(hit: Hit) -> None:
-            is_hit = hit.is_hit & (hit.lane >= first) & (hit.lane < last)
+            is_hit = hit.is_hit & (hit.lane >= band.first) & (hit.lane < band.last)
             node = dr.scatter_inc(used, uint(0), is_hit)
-            before = dr.scatter_exch(lists.heads, node, hit.lane - first, is_hit)
+            before = dr.scatter_exch(lists.heads, node, hit.lane - band.first, is_hit)
             dr.scatter(lists.following, before, node, is_hit)
             dr.scatter(lists.faces, hit.half_face, node, is_hit)
             dr.scatter(lists.depths, hit.depth, node, is_hit)
 
-        self._for_each(push, lists)
+        dr.eval(lists, used)
+        search.for_each(push, lambda: dr.eval(lists, used))
         return lists
-
-    def _for_each(self, visit: Any, results: Any) -> None:
-        backend = self.scene.backend
-        backend.run(results)
-        if self.bundle is not None:
-            self.bundle.for_each_fragment(visit)
-            backend.run(results)
-            return
-        for begin in range(0, self.half_faces, _FACES_AT_A_TIME):
-            count = min(_FACES_AT_A_TIME, self.half_faces - begin)
-            half_face = dr.arange(backend.UInt, count) + backend.opaque_uint(begin)
-            worker = backend.lanes(workers_for(count, self.scene.rays.count))
-            items = work_items(self.scene, half_face, worker)
-            for_each_hit(self.scene, items, visit)
-            backend.run(results)
-        if self.around_count:
-            self._for_each_around(visit)
-            backend.run(results)
-
-    def _for_each_around(self, visit: Any) -> None:
-        """Crossings of cells that hold the camera: they begin behind it, where no face is rasterised."""
-        scene, uint = self.scene, self.scene.backend.UInt
-        lane = dr.arange(uint, scene.rays.lane_count)
-        rays = scene.rays.of_lanes(lane)
-        count = scene.backend.opaque_uint(4 * self.around_count)
-
-        def body(index: Any) -> tuple[Any]:
-            half_face = 4 * dr.gather(uint, self.around, index >> 2) + (index & 3)
-            face, apex = scene.face_and_apex(rays.frame, half_face)
-            depth, exit_depth = crossing_depth(face), crossing_depth(find_exit(face, apex).face(face, apex))
-            is_hit = rays.valid & holds_ray(face) & (depth <= 0) & (exit_depth > 0)
-            visit(Hit(rays.pixel, lane, half_face, depth, is_hit))
-            return (index + 1,)
-
-        dr.while_loop((dr.zeros(uint, scene.rays.lane_count),), lambda index: index < count, body)

@@ -7,18 +7,29 @@ complexity. The image is made in bands when the lists of all pixels together wou
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 
 from difftetvr.backend import Backend
+from difftetvr.mesh import TetMesh
+from difftetvr.recording import few_lengths
+from difftetvr.rendering.search.bundle_hits import Stretches
+from difftetvr.rendering.search.memory_order import MemoryOrder
+from difftetvr.rendering.search.plan import Search, SearchPlan
 from difftetvr.rendering.search.scene import NONE
 from difftetvr.rendering.tracers.aim import Aim
 from difftetvr.rendering.tracers.bands import Band, bands_of
-from difftetvr.rendering.tracers.fragments import FragmentLists, FragmentRaster
-from difftetvr.rendering.traversal.crossing import Kernel, View, cross_cell, lanes_of
+from difftetvr.rendering.tracers.fragments import (
+    BundleFragments,
+    CameraFragments,
+    FragmentBand,
+    FragmentLists,
+    Fragments,
+)
+from difftetvr.rendering.traversal.crossing import Kernel, View, cross_cell
 from difftetvr.rendering.traversal.rays import Lanes
 
 FRAGMENT_BUDGET = 1 << 26
@@ -34,46 +45,54 @@ class LinkedList:
 
     Attributes:
         view: What kernels read.
-        raster: Finds fragments.
-        bands: Parts of the image whose lists fit the budget.
+        search: Finds fragments.
+        bands: All of the image; or, one after the other, parts of it whose lists fit the budget.
         local_size: Fragments that a ray sorts at a time.
+        starts_inside: Whether some crossings begin behind the camera.
     """
 
     view: View
-    raster: FragmentRaster
-    bands: list[Band]
+    search: Search
+    bands: FragmentBand | ManyBands
     local_size: int
+    starts_inside: bool
+
+    @staticmethod
+    def plan(backend: Backend, mesh: TetMesh, rays: Any, stretches: Stretches | None) -> SearchPlan:
+        """How to find the fragments of rays: those of a camera, or stretches of a bundle."""
+        if stretches is None:
+            return CameraFragments.of(backend, MemoryOrder.of(mesh).tables(backend), rays)
+        return BundleFragments.of(backend, mesh, stretches)
 
     @staticmethod
     def of(aim: Aim) -> LinkedList:
-        """Count the fragments of every ray."""
-        view, raster = aim.view, FragmentRaster(aim)
-        counts = raster.count()
-        longest = int(counts.max())
-        size = next((size for size in LOCAL_SIZES if size >= longest), LOCAL_SIZES[-1])
-        return LinkedList(view, raster, bands_of(counts, FRAGMENT_BUDGET), size)
-
-    @property
-    def starts_inside(self) -> bool:
-        """Whether some crossings begin behind the camera."""
-        return self.raster.starts_inside
+        """Take the fragments of every ray."""
+        found: Fragments = aim.found
+        size = next((size for size in LOCAL_SIZES if size >= found.longest), LOCAL_SIZES[-1])
+        return LinkedList(aim.view, found.search, _bands(aim.view, found), size, found.starts_inside)
 
     def on_lanes(self, lane: Any) -> None:
         """See :meth:`difftetvr.rendering.traversal.crossing.Tracer.on_lanes`."""
 
     def trace(self, make_kernel: Callable[[Lanes], Kernel]) -> None:
         """Sort every ray's fragments and cross their cells, front to back."""
-        for band in self.bands:
-            lists = self.raster.lists(band)
-            rays = lanes_of(self.view, band.first, band.last)
-            kernel = make_kernel(rays)
-            kernel.finish(self._resolve(kernel, rays, lists))
+        if isinstance(self.bands, FragmentBand):
+            self._trace_band(make_kernel, self.bands)
+            return
+        for band in self.bands.each(self.view.backend):
+            self._trace_band(make_kernel, band)
             self.view.backend.run()  # before the lists of the next band
 
-    def _resolve(self, kernel: Kernel, rays: Lanes, lists: FragmentLists) -> Any:
-        view, scene = self.view, self.raster.scene
+    def _trace_band(self, make_kernel: Callable[[Lanes], Kernel], band: FragmentBand) -> None:
+        lists = FragmentLists.of(self.search, band)
+        rays = self.view.rays.of_lanes(band.lane)
+        kernel = make_kernel(rays)
+        kernel.finish(self._resolve(kernel, rays, lists, band))
+
+    def _resolve(self, kernel: Kernel, rays: Lanes, lists: FragmentLists, band: FragmentBand) -> Any:
+        view, scene = self.view, self.search.scene
         uint, real, lanes = view.backend.UInt, view.backend.Float, dr.width(rays.pixel)
-        heads = dr.gather(uint, lists.heads, dr.arange(uint, lanes), rays.valid)
+        heads = dr.gather(uint, lists.heads, band.lane - band.first, rays.valid)
 
         def batch(more: Any, depth: Any, face: Any, ray: Any) -> tuple[Any, ...]:
             heap = _Heap(view.backend, self.local_size, lanes)
@@ -98,6 +117,34 @@ class LinkedList:
             kernel.start(),
         )
         return dr.while_loop(state, lambda more, *_: more, batch)[3]
+
+
+class ManyBands:
+    """Bands that must be waited for, each before the next: a recording would not, and hold the lists of several."""
+
+    def __init__(self, parts: list[Band]) -> None:
+        self._parts = parts
+
+    def each(self, backend: Backend) -> Iterator[FragmentBand]:
+        """The bands, one after the other."""
+        return (_band(backend, part) for part in self._parts)
+
+
+def _bands(view: View, found: Fragments) -> FragmentBand | ManyBands:
+    """All lanes, as many at a time as the budget lets."""
+    backend, lanes = view.backend, view.rays.lane_count
+    # The total may have run over where it could be so great.
+    if found.total <= FRAGMENT_BUDGET and found.longest * lanes < 1 << 32:
+        return _band(backend, Band(0, lanes, found.total))
+    parts = bands_of(backend.tensor(backend.Int(found.count)).long(), FRAGMENT_BUDGET)
+    return _band(backend, parts[0]) if len(parts) == 1 else ManyBands(parts)
+
+
+def _band(backend: Backend, part: Band) -> FragmentBand:
+    count, first, last = part.last - part.first, backend.constant(part.first), backend.constant(part.last)
+    lane = dr.arange(backend.UInt, count) + first if part.first else backend.lanes(count)
+    dr.eval(lane)
+    return FragmentBand(lane, first, last, count, few_lengths(part.total))
 
 
 class _Heap:

@@ -11,11 +11,16 @@ from typing import Any
 
 import drjit as dr
 
-from difftetvr.rendering.search.bundle_hits import BundleSearch
-from difftetvr.rendering.search.entry import EntryLists, find_entries
+from difftetvr.backend import Backend
+from difftetvr.mesh import TetMesh
+from difftetvr.rendering.search.bundle_hits import BundleEntries, Stretches
+from difftetvr.rendering.search.camera_hits import CameraEntries
+from difftetvr.rendering.search.entry import EntryLists
+from difftetvr.rendering.search.memory_order import MemoryOrder
+from difftetvr.rendering.search.plan import SearchPlan
 from difftetvr.rendering.search.scene import Scene
 from difftetvr.rendering.tracers.aim import Aim
-from difftetvr.rendering.traversal.crossing import Kernel, Step, View, lanes_of
+from difftetvr.rendering.traversal.crossing import Kernel, Step, View
 from difftetvr.rendering.traversal.rays import Lanes
 from difftetvr.rendering.traversal.walk import BOUNDARY, Face, interpolate, make_face, table_row
 
@@ -37,13 +42,16 @@ class Marching:
     entries: EntryLists
 
     @staticmethod
+    def plan(backend: Backend, mesh: TetMesh, rays: Any, stretches: Stretches | None) -> SearchPlan:
+        """How to find where rays enter a mesh, or start in it: those of a camera, or stretches of a bundle."""
+        if stretches is None:
+            return CameraEntries.of(backend, MemoryOrder.of(mesh).tables(backend), rays)
+        return BundleEntries.of(backend, mesh, stretches)
+
+    @staticmethod
     def of(aim: Aim) -> Marching:
-        """Find where rays enter the mesh."""
-        view, entries = aim.view, aim.entries
-        if entries is None:
-            search = BundleSearch.for_entries(aim.scene, aim.ordered, view.limits)
-            entries = find_entries(search, has_starts=view.limits is not None)
-        return Marching(view, aim.scene, aim.ordered.tables.walk, entries)
+        """Take where rays enter the mesh."""
+        return Marching(aim.view, aim.scene, aim.tables.walk, aim.found)
 
     @property
     def starts_inside(self) -> bool:
@@ -56,7 +64,7 @@ class Marching:
 
     def trace(self, make_kernel: Callable[[Lanes], Kernel]) -> None:
         """Walk every ray through all cells it crosses, front to back."""
-        rays = lanes_of(self.view)
+        rays = self.view.lanes
         kernel = make_kernel(rays)
         kernel.finish(self._walk(kernel, rays))
 

@@ -14,11 +14,14 @@ from typing import Any
 
 import drjit as dr
 
+from difftetvr.backend import Backend
+from difftetvr.mesh import TetMesh
+from difftetvr.rendering.search.bundle_hits import Stretches
 from difftetvr.rendering.search.scene import Scene
 from difftetvr.rendering.tracers.aim import Aim
 from difftetvr.rendering.tracers.cell_order import visibility_order
 from difftetvr.rendering.tracers.tiles import TILE_BITS, TileLists, Tiler
-from difftetvr.rendering.traversal.crossing import Kernel, View, cross_cell, lanes_of
+from difftetvr.rendering.traversal.crossing import Kernel, View, cross_cell
 from difftetvr.rendering.traversal.rays import Lanes
 
 PAIR_BUDGET = 1 << 23
@@ -36,20 +39,26 @@ class Projected:
     Attributes:
         view: What kernels read.
         scene: The cells.
-        tiler: Sorts them into tiles.
+        columns: Tiles in a row of the image.
+        parts: The cells of each tile, front to back; where they are too many to be held, what sorts some at a time.
         starts_inside: Whether some crossings may begin behind the camera.
     """
 
     view: View
     scene: Scene
-    tiler: Tiler
+    columns: int
+    parts: list[TileLists] | Tiler
     starts_inside: bool
+
+    @staticmethod
+    def plan(backend: Backend, mesh: TetMesh, rays: Any, stretches: Stretches | None) -> None:
+        """Nothing is looked for along rays."""
 
     @staticmethod
     def of(aim: Aim) -> Projected:
         """Order the cells of a mesh in camera space."""
-        vertices = aim.ordered.positions
-        cells = visibility_order(aim.ordered.order.mesh(aim.mesh), vertices)
+        vertices = aim.positions
+        cells = visibility_order(aim.order.mesh(aim.mesh), vertices)
         if not cells.exact:
             warnings.warn(
                 "The cells of this mesh have no certain front-to-back order for the whole view (it is not convex, has "
@@ -59,25 +68,31 @@ class Projected:
                 stacklevel=2,
             )
         starts_inside = bool(vertices[:, 2].amin() <= 0)
-        return Projected(aim.view, aim.scene, Tiler(aim.scene, cells.order, PAIR_BUDGET), starts_inside)
+        tiler = Tiler(aim.scene, cells.order, PAIR_BUDGET)
+        parts = [*tiler.lists()] if len(tiler.parts) < 2 else tiler
+        return Projected(aim.view, aim.scene, tiler.columns, parts, starts_inside)
 
     def on_lanes(self, lane: Any) -> None:
         """See :meth:`difftetvr.rendering.traversal.crossing.Tracer.on_lanes`."""
 
     def trace(self, make_kernel: Callable[[Lanes], Kernel]) -> None:
         """Cross the cells of every tile, front to back."""
-        rays = lanes_of(self.view)
+        rays = self.view.lanes
         kernel = make_kernel(rays)
         ray = kernel.start()
-        for part in self.tiler.parts:
-            ray = self._composite(kernel, rays, self.tiler.lists(part), ray)
-            self.view.backend.run(ray)
+        if isinstance(self.parts, list):
+            for lists in self.parts:
+                ray = self._composite(kernel, rays, lists, ray)
+        else:
+            for lists in self.parts.lists():
+                ray = self._composite(kernel, rays, lists, ray)
+                self.view.backend.run(ray)  # before the lists of the next part
         kernel.finish(ray)
 
     def _composite(self, kernel: Kernel, rays: Lanes, lists: TileLists, ray: Any) -> Any:
         uint, width = self.view.backend.UInt, self.scene.image.width
         row = rays.pixel // width
-        tile = (row >> TILE_BITS) * self.tiler.columns + ((rays.pixel - row * width) >> TILE_BITS)
+        tile = (row >> TILE_BITS) * self.columns + ((rays.pixel - row * width) >> TILE_BITS)
         end = dr.gather(uint, lists.end, tile, rays.valid)
 
         def cross(index: Any, ray: Any) -> tuple[Any, Any]:

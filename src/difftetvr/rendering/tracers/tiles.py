@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -60,8 +61,11 @@ class Tiler:
         self.pairs, self.width, self.first = (backend.tensor(part)[seen] for part in (pairs, self.width, self.first))
         self.parts = [slice(band.first, band.last) for band in bands_of(self.pairs.long(), budget)]
 
-    def lists(self, part: slice) -> TileLists:
-        """Lists of the cells at some places of the order."""
+    def lists(self) -> Iterator[TileLists]:
+        """Lists of the first cells of the order, then of the next, and so on."""
+        return (self._lists(part) for part in self.parts)
+
+    def _lists(self, part: slice) -> TileLists:
         backend = self.scene.backend
         pairs, width, first = self.pairs[part], self.width[part], self.first[part]
         owner = torch.repeat_interleave(torch.arange(pairs.shape[0], device=pairs.device, dtype=torch.int32), pairs)

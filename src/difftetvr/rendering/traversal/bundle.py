@@ -32,11 +32,10 @@ class BundleRays:
 
     @staticmethod
     def of(backend: Backend, lines: torch.Tensor, order: torch.Tensor | None) -> BundleRays:
-        """Upload (N, 6) origins and directions, and (N,) int32 numbers of the lanes' rays."""
+        """Take (N, 6) origins and directions, which must not change, and (N,) int32 numbers of the lanes' rays."""
         count = lines.shape[0]
         lanes = None if order is None else backend.uints(order)
-        # A copy: the backward pass wants the rays as they are now.
-        return BundleRays(backend, backend.floats(lines.clone()), lanes, backend.opaque_uint(count), count)
+        return BundleRays(backend, backend.floats(lines), lanes, backend.opaque_uint(count), count)
 
     @property
     def lane_count(self) -> int:

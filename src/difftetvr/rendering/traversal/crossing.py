@@ -59,16 +59,14 @@ class View:
         return Records(self.channels)
 
     @property
+    def lanes(self) -> Lanes:
+        """All rays, one a lane."""
+        return self.rays.of_lanes(self.lane)
+
+    @property
     def has_vertex_channels(self) -> bool:
         """Whether channels are those of vertices, which rays gather as they drop them."""
         return self.channels > 0 and self.cells is None and self.transfer is None
-
-
-def lanes_of(view: View, first: int = 0, last: int | None = None) -> Lanes:
-    """All rays of a view, one a lane; or those of the lanes from ``first`` to before ``last``."""
-    if last is None:
-        return view.rays.of_lanes(view.lane)
-    return view.rays.of_lanes(dr.arange(view.backend.UInt, last - first) + view.backend.opaque_uint(first))
 
 
 @dataclass

@@ -12,14 +12,16 @@ from matplotlib.ticker import MaxNLocator
 from difftetvr.capture.viewing import Floats
 from difftetvr.rendering.cameras.pinhole import Camera
 from difftetvr.view.frames.color_bar import labels_of
-from difftetvr.view.frames.lettering import Layer
+from difftetvr.view.frames.lettering import Box, Layer
 
 ROOM = 0.12
 """Share of a picture on each side that numbers take."""
 
 _NAMES = "xyz"
 _TICKS = 5
-_CLOSE = 2.2  # letters between two ticks, below which every second number is left out
+_UPRIGHT = 3.0  # how many times as high as wide the line of an upright axis is at least
+_TRIES = 4  # places for the name of an axis, each a letter's height farther out
+_TICK, _GAP = 0.5, 0.4  # lengths of ticks, and what is free between them and words, in heights of letters
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,13 +91,27 @@ class ProjectedBox:
         low, high = lengths[:, axis].tolist()
         values = [float(v) for v in MaxNLocator(_TICKS).tick_values(low, high) if low <= v <= high]
         places = self._along(axis, ends, [(value - low) / (high - low) for value in values])
-        step = float(np.linalg.norm(np.diff(places, axis=0), axis=1).min()) if len(places) > 1 else np.inf
-        skip = 2 if step < _CLOSE * layer.letters else 1
-        for place, label in list(zip(places, labels_of(values, low, high), strict=True))[::skip]:
-            layer.line([place, place + 0.5 * layer.letters * out])
-            layer.text(place + 1.5 * layer.letters * out, label)
-        unit = f" ({self._box.unit})" if self._box.unit else ""
-        layer.text(line.mean(0) + 3.2 * layer.letters * out, f"{_NAMES[axis]}{unit}")
+        away = (_TICK + _GAP) * layer.letters
+        labels = labels_of(values, low, high)
+        boxes = [layer.box_beside(place, out, away, label) for place, label in zip(places, labels, strict=True)]
+        farthest = away
+        for index in range(0, len(boxes), _step_of(boxes, layer.room)):
+            if layer.write_in(boxes[index], labels[index]):
+                layer.line([places[index], places[index] + _TICK * layer.letters * out])
+                size = boxes[index].right - boxes[index].left, boxes[index].bottom - boxes[index].top
+                farthest = max(farthest, away + float(np.abs(out) @ size))
+        self._write_name(layer, axis, line, out, farthest)
+
+    def _write_name(self, layer: Layer, axis: int, line: Floats, out: Floats, away: float) -> None:
+        """Writes what an axis is called: above upright ones, beside the numbers of others, wherever there is room."""
+        name = f"{_NAMES[axis]} ({self._box.unit})" if self._box.unit else _NAMES[axis]
+        across, upwards = np.ptp(line, axis=0)
+        place = line.mean(0)
+        if upwards > _UPRIGHT * across:
+            place, out, away = line[line[:, 1].argmin()], np.array([0.0, -1.0]), 0.0
+        for further in range(_TRIES):
+            if layer.write_in(layer.box_beside(place, out, away + (_GAP + further) * layer.letters, name), name):
+                return
 
     def _edges(self) -> list[tuple[int, tuple[int, int]]]:
         """Direction of each edge, and at which ends of the other two axes it lies."""
@@ -119,3 +135,12 @@ class ProjectedBox:
     def _seen(self, points: Floats) -> tuple[Floats, Floats]:
         pixels, enlarged = self._camera.project(torch.from_numpy(points))
         return pixels.detach().cpu().numpy(), enlarged.detach().cpu().numpy()
+
+
+def _step_of(boxes: list[Box], room: float) -> int:
+    """Every how many numbers are written, so that there is room between them."""
+    return next(
+        step
+        for step in range(1, len(boxes) + 2)
+        if not any(one.meets(other, room) for one, other in itertools.pairwise(boxes[::step]))
+    )

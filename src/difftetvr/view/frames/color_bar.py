@@ -21,8 +21,8 @@ ROOM = 0.16
 _LEFT, _WIDTH, _TOP, _BOTTOM = 1.0 - 0.88 * ROOM, 0.022, 0.22, 0.80
 _STEPS = 256
 _LEAST_ROOM = 72  # pixels of a bar beside a picture
-_LETTER = 0.64  # width of a digit, in heights of letters
 _FEWEST_DECADES = 1.0  # from which on ticks are powers of ten
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,9 +56,10 @@ class ColorScale:
             return [(0.0, f"{low:.3g}"), (1.0, f"{high:.3g}")]
         has_decades = self.is_log and math.log10(high) - math.log10(low) >= _FEWEST_DECADES
         locator = LogLocator(numticks=8) if has_decades else MaxNLocator(6)
-        values = [float(value) for value in locator.tick_values(low, high) if low <= value <= high]
+        with np.errstate(over="ignore"):  # of ticks beyond the greatest number, which are left out
+            values = [float(value) for value in locator.tick_values(low, high) if low <= value <= high]
         if has_decades:
-            labels = [f"$10^{{{round(math.log10(value))}}}$" for value in values]
+            labels = ["10" + str(round(math.log10(value))).translate(_RAISED) for value in values]
         else:
             labels = labels_of(values, low, high)
         return [(self._place(value), label) for value, label in zip(values, labels, strict=True)]
@@ -90,9 +91,9 @@ def draw_color_bar(layer: Layer, scale: ColorScale) -> None:
         scale: What it shows.
     """
     ticks, thickness = scale.ticks(), _WIDTH * layer.width
-    longest = max((len(label) for _, label in ticks if "$" not in label), default=0)
+    longest = max((layer.size_of(label)[0] for _, label in ticks), default=0.0)
     # Long numbers push the bar to the left, so that they end within the picture.
-    left = min(_LEFT * layer.width, layer.width - thickness - (1.2 + _LETTER * longest) * layer.letters)
+    left = min(_LEFT * layer.width, layer.width - thickness - longest - 1.2 * layer.letters)
     right = left + thickness
     top, bottom = _TOP * layer.height, _BOTTOM * layer.height
     colors = scale.colors(_STEPS).numpy()[:, None]
@@ -106,7 +107,8 @@ def draw_color_bar(layer: Layer, scale: ColorScale) -> None:
         layer.line([(right, y), (right + 0.4 * layer.letters, y)])
         layer.text((right + 0.7 * layer.letters, y), label, across="left")
     # From the right edge of the picture, whatever its length.
-    layer.text((layer.width - 0.6 * layer.letters, top - layer.letters), scale.label, across="right", along="bottom")
+    label = layer.fitting(scale.label, layer.width - 1.2 * layer.letters)
+    layer.text((layer.width - 0.6 * layer.letters, top - layer.letters), label, across="right", along="bottom")
 
 
 def beside_color_bar(picture: Image.Image, scale: ColorScale, background: tuple[float, float, float]) -> Image.Image:

@@ -60,10 +60,10 @@ def framed(color: torch.Tensor, alpha: torch.Tensor, camera: Camera, style: Fram
     if box is None and style.scale is None:
         return picture
     layer = Layer(camera.width, camera.height, ink)
-    if box is not None:
-        box.draw_numbers(layer)
     if style.scale is not None:
         draw_color_bar(layer, style.scale)
+    if box is not None:
+        box.draw_numbers(layer)
     whole = Image.alpha_composite(picture.convert("RGBA"), layer.drawn())
     return whole if style.background is None else whole.convert("RGB")
 

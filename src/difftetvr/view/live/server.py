@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import io
+import logging
 import socket
 import warnings
 from collections.abc import Callable, Iterator
@@ -213,6 +214,8 @@ def _serving(host: str, port: int) -> ViserServer:
         def request_share_url(self, verbose: bool = True) -> str | None:
             return None
 
+    # What strangers send breaks their own connections alone; without a handler it would be told with a traceback.
+    logging.getLogger("websockets").addHandler(logging.NullHandler())
     with _silent():
         server = Server(host=host, port=port, verbose=False)
     _refuse_strangers(server, is_local=host in _OWN)

@@ -52,6 +52,8 @@ class Appearance:
         positions, per_value = self._positions(distribution.values, low, high)
         in_ranges = replace(distribution, slopes=distribution.slopes * per_value)
         knots, densities = opacity_knots(self.opacity, in_ranges, positions)
+        if self.is_log and distribution.ends[0] <= 0.0:
+            densities[0] = 0.0  # with which what has no logarithm is transparent: it lies below the range
         attenuation = float(densities.max()) or 1.0
         opacity = densities / attenuation
         colors = colormap_colors(self.colormap, knots)

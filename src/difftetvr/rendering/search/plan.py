@@ -1,0 +1,118 @@
+"""What is looked for along rays before light is gathered: planned by the host, found by kernels, and waited for once.
+
+A plan knows what does not depend on where vertices are, so that laying out a mesh and the search in it are one
+recording; what the host has to hear of it comes in one array.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import drjit as dr
+
+from difftetvr.rendering.search.hits import Settle, Visit
+from difftetvr.rendering.search.scene import Scene
+
+
+class Search(Protocol):
+    """Goes through what rays meet."""
+
+    scene: Scene
+
+    def for_each(self, visit: Visit, settle: Settle) -> None:
+        """Call ``visit`` for all half-faces that are looked for, ``settle`` after each kernel's worth of them."""
+        ...
+
+
+@dataclass
+class Counts:
+    """How much there is.
+
+    Attributes:
+        count: (N,) of each ray, or each lane.
+        half_faces: (N,) one of what each has, which is all where none has more; None where lists are made anyhow.
+        most: (1,) the greatest number.
+        total: (1,) the sum of the numbers.
+    """
+
+    count: Any
+    half_faces: Any | None
+    most: Any
+    total: Any
+
+    @staticmethod
+    def of(count: Any, half_faces: Any | None) -> Counts:
+        """From what each ray has."""
+        # Of no rays there is no maximum.
+        ends = (dr.max(count), dr.sum(count)) if dr.width(count) else (dr.zeros(type(count), 1) for _ in range(2))
+        most, total = ends
+        dr.eval(most, total)
+        return Counts(count, half_faces, most, total)
+
+
+@dataclass
+class Around:
+    """Cells around the one point where rays begin.
+
+    Attributes:
+        cells: (capacity,) the cells, in any order.
+        count: (1,) their number, which may be greater than the capacity.
+    """
+
+    cells: Any
+    count: Any
+
+
+@dataclass
+class Found:
+    """What kernels found by a plan.
+
+    Attributes:
+        counts: How much it is.
+        around: The cells around where rays begin; None where there is no one point.
+        boxes: Of the hierarchies that were built.
+    """
+
+    counts: Counts
+    around: Around | None
+    boxes: list[Any]
+
+
+@dataclass(frozen=True)
+class Told:
+    """What the host hears of it.
+
+    Attributes:
+        most: The greatest number that a ray has.
+        total: The sum of all numbers.
+        around: How many cells there are around where rays begin.
+        sees_all: Whether no ray begins or ends near the mesh, so that limits do not matter.
+    """
+
+    most: int
+    total: int
+    around: int
+    sees_all: bool
+
+
+class SearchPlan(Protocol):
+    """What to look for, and in what."""
+
+    @property
+    def capacity(self) -> int:
+        """How many cells around the one point there is room for."""
+        ...
+
+    @property
+    def sees_all(self) -> Any | None:
+        """(1,) 1 if no ray begins or ends near the mesh, else 0; None where that need not be told."""
+        ...
+
+    def find(self, scene: Scene, extent: Any) -> Found:
+        """Look for it, for :func:`difftetvr.recording.replayed`, with vertices of some extent."""
+        ...
+
+    def settled(self, scene: Scene, found: Found, told: Told) -> Any:
+        """What the tracer needs to know of it."""
+        ...
