@@ -1,4 +1,4 @@
-"""Pages of `difftetvr export`: their size, and what a browser draws against `render`.
+"""Pages of `difftetvr export`: their size, and what a browser draws against `render`, by WebGL 2 and by WebGPU.
 
 Three views of each, two from outside and one from inside, 320 x 240 pixels; needs Chromium, which draws without a GPU
 here. Models with color and density are given, simulations are those of the folder of example data, where it is.
@@ -22,7 +22,7 @@ from difftetvr.mesh.io import load_data, scalar_of
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
-from view.browser import CHROMIUM, Browser, rendered  # noqa: E402  the driver of the tests
+from view.browser import CHROMIUM, WEBGPU_OPTIONS, Browser, rendered  # noqa: E402  the driver of the tests
 
 BACKGROUND = (0.2, 0.4, 0.6)  # of which 8 bits hold each exactly
 DIRECTIONS = ((0.45, -1.0, 0.35), (-1.1, 0.7, 0.4), (0.1, 0.05, 0.03))  # in longest sides from the middle
@@ -60,6 +60,24 @@ def cameras(mesh: dtv.TetMesh) -> Iterator[dtv.Camera]:
         yield dtv.Camera.look_at(eye, center, (0.0, 0.0, 1.0), 0.9, 320, 240)
 
 
+def drawn_by(
+    browser: Browser, page: Path, mesh: dtv.TetMesh, field: dtv.Field | dtv.ScalarField
+) -> tuple[float, list[dict[str, float]]]:
+    """Least PSNR of a page's pictures in a browser, and what happened to their rays."""
+    browser.open(page)
+    names = {"#webgl": "WebGL 2", "#webgpu": "WebGPU"}
+    if browser.run("difftetvr.renderer") != names[browser.fragment]:
+        sys.exit(f"This Chromium has no {names[browser.fragment]} to offer.")
+    ratios, audits = [], []
+    for camera in cameras(mesh):
+        pixels, audit = rendered(browser, camera, BACKGROUND)
+        with torch.no_grad():
+            truth = dtv.render(mesh, field, camera, torch.tensor(BACKGROUND)).color.clamp(0.0, 1.0)
+        ratios.append(psnr(torch.from_numpy(pixels).float(), truth))
+        audits.append(audit)
+    return min(ratios), audits
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("models", nargs="*", type=Path)
@@ -67,23 +85,21 @@ def main() -> None:
     options = parser.parse_args()
     if CHROMIUM is None:
         sys.exit("There is no Chromium here, in which pages could be drawn.")
-    print("| volume | cells | page (MB) | least PSNR (dB) | most cells of a ray | rays lost |")
-    print("|---|---|---|---|---|---|")
-    with tempfile.TemporaryDirectory() as folder, Browser() as browser:
+    print("| volume | cells | page (MB) | least PSNR (dB), WebGL 2 | WebGPU | most cells of a ray | rays lost |")
+    print("|---|---|---|---|---|---|---|")
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        Browser(fragment="#webgl") as webgl,
+        Browser(options=WEBGPU_OPTIONS, fragment="#webgpu") as webgpu,
+    ):
         for name, make in scenes(options.models, options.meshes):
             mesh, field = make()
             page = dtv.view.save_page(Path(folder) / "a.html", mesh, field)
-            browser.open(Path(folder) / "a.html")
-            ratios, audits = [], []
-            for camera in cameras(mesh):
-                pixels, audit = rendered(browser, camera, BACKGROUND)
-                with torch.no_grad():
-                    truth = dtv.render(mesh, field, camera, torch.tensor(BACKGROUND)).color.clamp(0.0, 1.0)
-                ratios.append(psnr(torch.from_numpy(pixels).float(), truth))
-                audits.append(audit)
+            (gl, audits), (gpu, others) = (drawn_by(b, Path(folder) / "a.html", mesh, field) for b in (webgl, webgpu))
+            audits += others
             most, lost = max(a["mostSteps"] for a in audits), sum(a["lost"] + a["bounded"] for a in audits)
             size = len(page.text) / 1e6
-            print(f"| {name} | {mesh.num_cells} | {size:.2f} | {min(ratios):.1f} | {most} | {lost} |", flush=True)
+            print(f"| {name} | {mesh.num_cells} | {size:.2f} | {gl:.1f} | {gpu:.1f} | {most} | {lost} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -9,6 +9,8 @@ import select
 import shutil
 import subprocess
 import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -21,17 +23,31 @@ _OPTIONS = [
     *("--remote-debugging-pipe", "--no-first-run", "--disable-extensions", "--hide-scrollbars", "--mute-audio"),
 ]
 
-
+# WebGPU without a graphics card, and how its pictures come to the screen.
+WEBGPU_OPTIONS = (
+    *("--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader"),
+    *("--enable-features=Vulkan", "--use-vulkan=swiftshader"),
+)
+# What is in the log, but is no complaint about a page: that there is no graphics card, and that reading takes time.
+_REMARKS = ("No available adapters", "GL Driver Message (OpenGL, Performance")
 _LONGEST_WAIT = 60  # seconds
 
 
 class Browser:
-    """A browser with one window; a context manager."""
+    """A browser with one window; a context manager.
 
-    def __init__(self, width: int = 640, height: int = 480) -> None:
+    Args:
+        width: Pixels of the window's inside.
+        height: Likewise.
+        options: Further ones of Chromium's.
+        fragment: What is put behind the addresses of pages: which renderer draws.
+    """
+
+    def __init__(self, width: int = 640, height: int = 480, options: Sequence[str] = (), fragment: str = "") -> None:
         assert CHROMIUM is not None
+        self.fragment = fragment
         self._folder = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
-        command = [CHROMIUM, *_OPTIONS, f"--user-data-dir={self._folder.name}"]
+        command = [CHROMIUM, *_OPTIONS, *options, f"--user-data-dir={self._folder.name}"]
         its_input, self._to = os.pipe()
         self._from, its_output = os.pipe()
         # The protocol's ends are files 3 and 4, whatever numbers the pipes have here.
@@ -80,13 +96,22 @@ class Browser:
 
     def open(self, page: Path) -> None:
         """Opens a page and waits until its script has begun."""
-        self.call("Page.navigate", url=page.resolve().as_uri())
+        # From elsewhere: to go to the address of the page that is open, with a fragment, would load nothing.
+        self.call("Page.navigate", url="about:blank")
+        self.call("Page.navigate", url=page.resolve().as_uri() + self.fragment)
         self.wait_for("window.difftetvr || document.querySelector('.failure')")
 
     def visit(self, address: str) -> None:
         """Goes to an address and waits until something can be drawn there."""
         self.call("Page.navigate", url=address)
         self.wait_for("document.querySelector('canvas')")
+
+    @contextmanager
+    def scripted(self, script: str) -> Iterator[None]:
+        """Pages that are opened meanwhile run a script before their own."""
+        hook = self.call("Page.addScriptToEvaluateOnNewDocument", source=script)["identifier"]
+        yield
+        self.call("Page.removeScriptToEvaluateOnNewDocument", identifier=hook)
 
     @property
     def failure(self) -> str | None:
@@ -140,7 +165,9 @@ class Browser:
         elif method == "Runtime.consoleAPICalled" and parameters["type"] in ("error", "warning"):
             self.errors.append(str(parameters["args"]))
         elif method == "Log.entryAdded" and parameters["entry"]["level"] in ("error", "warning"):
-            self.errors.append(str(parameters["entry"]))
+            entry = parameters["entry"]
+            if not any(remark in entry["text"] for remark in _REMARKS):
+                self.errors.append(str(entry))
         elif method == "Network.requestWillBeSent":
             self.requests.append(parameters["request"]["url"])
 

@@ -9,12 +9,24 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from view.browser import CHROMIUM, Browser, rendered
+from view.browser import CHROMIUM, WEBGPU_OPTIONS, Browser
+from view.page_scenes import (
+    CAMERAS,
+    constant_colors,
+    constant_scalars,
+    directional_colors,
+    jittered,
+    psnr,
+    require_alike,
+    require_no_complaints,
+    require_webgpu,
+    scalars_with_a_jump,
+)
 
 import difftetvr as dtv
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.optics import TransferFunction
-from difftetvr.rendering import Camera, ScalarField, render
+from difftetvr.rendering import Camera, ScalarField
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium")
 
@@ -22,83 +34,51 @@ SETTLED = "/pixels in/.test(document.querySelector('.drawn').textContent)"
 
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with Browser(720, 480) as browser:
+def webgl() -> Iterator[Browser]:
+    with Browser(720, 480, fragment="#webgl") as browser:
         yield browser
 
 
-@pytest.fixture(autouse=True)
-def without_complaints(browser) -> Iterator[None]:
-    yield
-    assert not browser.errors and all(r.startswith(("file:", "data:", "blob:")) for r in browser.requests)
+@pytest.fixture(scope="module")
+def webgpu(tmp_path_factory) -> Iterator[Browser]:
+    with Browser(720, 480, WEBGPU_OPTIONS, "#webgpu") as browser:
+        require_webgpu(browser, tmp_path_factory.mktemp("empty"))
+        yield browser
 
 
-def jittered(*shape: int) -> TetMesh:
-    torch.manual_seed(1)
-    mesh = TetMesh.grid(shape, (3.0, -1.0, 5.0), (5.0, 1.0, 6.0))
-    return mesh.with_vertices(mesh.vertices + 0.06 * torch.rand(mesh.vertices.shape))
-
-
-def with_holes(mesh: TetMesh) -> TetMesh:
-    """Every sixth group of cells taken away, so that rays leave the mesh and enter again."""
-    kept = (torch.arange(mesh.num_cells) // 24) % 6 != 0
-    return TetMesh(mesh.vertices, mesh.tets[kept])
-
-
-def camera_at(*eye: float, width: int = 64, height: int = 48) -> Camera:
-    return Camera.look_at(eye, (4.0, 0.0, 5.5), (0.0, 0.0, 1.0), 0.8, width, height)
-
-
-def require_alike(browser, mesh, field, cameras, background=(0.2, 0.5, 0.1), clip=None) -> None:
-    """At least 50 dB between the page and `render`, and no ray lost."""
-    for camera in cameras:
-        pixels, audit = rendered(browser, camera, background, clip)
-        with torch.no_grad():
-            truth = render(mesh, field, camera, torch.tensor(background), clip_plane=clip).color.clamp(0.0, 1.0)
-        assert truth.std() > 0.02
-        assert float(dtv.fitting.metrics.psnr(torch.tensor(pixels).float(), truth)) > 50.0
-        assert audit["lost"] == audit["bounded"] == 0 and audit["rays"] == camera.width * camera.height
-        assert 0 < audit["mostSteps"] <= mesh.num_cells
+@pytest.fixture(params=["webgl", "webgpu"])
+def browser(request) -> Iterator[Browser]:
+    browser = request.getfixturevalue(request.param)
+    yield browser
+    require_no_complaints(browser)
 
 
 def opened(browser, tmp_path, mesh, field, **options) -> None:
     dtv.view.save_page(tmp_path / "a.html", mesh, field, dtv.view.PageOptions(**options))
     browser.open(tmp_path / "a.html")
     assert browser.failure is None
-
-
-CAMERAS = [camera_at(1.5, -3.5, 6.5), camera_at(5.5, 1.0, 9.0), camera_at(4.1, 0.1, 5.6)]
+    assert browser.run("difftetvr.renderer") == {"#webgl": "WebGL 2", "#webgpu": "WebGPU"}[browser.fragment]
 
 
 def test_directional_colours_of_a_mesh_with_holes(browser, tmp_path):
-    mesh = with_holes(jittered(6, 6, 6))
-    count = mesh.num_vertices
-    color, harmonics = torch.rand(count, 3), 0.3 * torch.randn(count, 15, 3)
-    # From nothing to cells that are opaque: all branches of the integral.
-    field = Field(color, 10.0 ** (4 * torch.rand(count) - 2), harmonics=harmonics)
-    opened(browser, tmp_path, mesh, field)
-    require_alike(browser, mesh, field, CAMERAS)
-    require_alike(browser, mesh, field, CAMERAS[:1], clip=(0.6, 0.8, 0.1, -3.0))
+    scene = directional_colors()
+    opened(browser, tmp_path, *scene)
+    require_alike(browser, scene, CAMERAS)
+    require_alike(browser, scene, CAMERAS[:1], clip=(0.6, 0.8, 0.1, -3.0))
 
 
 def test_scalars_with_a_jump(browser, tmp_path):
-    mesh = jittered(5, 5, 5)
-    function = TransferFunction([0.1, 0.3, 0.3, 0.6, 0.62, 0.9], [0.0, 0.05, 0.6, 0.0, 1.0, 0.2], torch.rand(6, 3))
-    field = ScalarField((mesh.vertices - 4.0).square().sum(1), function, 4.0)
-    opened(browser, tmp_path, mesh, field)
-    require_alike(browser, mesh, field, CAMERAS)
-    require_alike(browser, mesh, field, CAMERAS[1:2], clip=(0.0, 0.0, -1.0, 5.6))
+    scene = scalars_with_a_jump()
+    opened(browser, tmp_path, *scene)
+    require_alike(browser, scene, CAMERAS)
+    require_alike(browser, scene, CAMERAS[1:2], clip=(0.0, 0.0, -1.0, 5.6))
 
 
-@pytest.mark.parametrize("is_scalar", [False, True])
-def test_cells_that_are_constant(browser, tmp_path, is_scalar):
-    mesh = jittered(4, 4, 4)
-    count = mesh.num_cells
-    field: Field | ScalarField = Field(torch.rand(count, 3), 3.0 * torch.rand(count), "cell", torch.randn(count, 3, 3))
-    if is_scalar:
-        field = ScalarField(torch.arange(count).double(), TransferFunction.default(), 20.0, location="cell")
-    opened(browser, tmp_path, mesh, field)
-    require_alike(browser, mesh, field, CAMERAS)
+@pytest.mark.parametrize("scene", [constant_colors, constant_scalars])
+def test_cells_that_are_constant(browser, tmp_path, scene):
+    scene = scene()
+    opened(browser, tmp_path, *scene)
+    require_alike(browser, scene, CAMERAS)
 
 
 def test_rays_along_edges_and_through_vertices(browser, tmp_path):
@@ -112,7 +92,7 @@ def test_rays_along_edges_and_through_vertices(browser, tmp_path):
         for k, e in enumerate(eyes[:3])
     ]
     cameras.append(Camera.look_at(eyes[3], (0.5, 1.5, 0.5), (0, 0, 1), 1.2, 65, 65))
-    require_alike(browser, mesh, field, cameras)
+    require_alike(browser, (mesh, field), cameras)
 
 
 def test_cells_that_rounding_turns_inside_out(browser, tmp_path):
@@ -127,7 +107,7 @@ def test_cells_that_rounding_turns_inside_out(browser, tmp_path):
     page = dtv.view.save_page(tmp_path / "a.html", mesh, field)
     assert page.inverted > 5 and float(mesh.volumes().min()) > 0.0
     browser.open(tmp_path / "a.html")
-    require_alike(browser, mesh, field, CAMERAS[:2])
+    require_alike(browser, (mesh, field), CAMERAS[:2])
 
 
 def changed_by(browser, action) -> bool:
@@ -183,14 +163,67 @@ def test_what_hands_do(browser, tmp_path):
     browser.resize(720, 480)
 
 
-def test_a_browser_without_webgl_says_so_and_shows_the_poster(browser, tmp_path):
+def test_both_renderers_draw_the_same(webgl, webgpu, tmp_path):
+    scene = scalars_with_a_jump()
+    pictures = []
+    for browser in (webgl, webgpu):
+        opened(browser, tmp_path, *scene)
+        pictures.append(require_alike(browser, scene, CAMERAS))
+    for one, other in zip(*pictures, strict=True):
+        assert psnr(one, other) > 50.0
+
+
+@pytest.mark.parametrize(
+    ("hidden", "reason"),
+    [
+        ("Object.defineProperty(navigator, 'gpu', { value: undefined })", "This browser has no WebGPU."),
+        (
+            "Object.defineProperty(navigator, 'gpu', { value: { requestAdapter: async () => null } })",
+            "WebGPU finds no graphics card here.",
+        ),
+    ],
+    ids=["no-webgpu", "no-adapter"],
+)
+def test_where_there_is_no_webgpu_webgl_draws(webgl, tmp_path, hidden, reason):
+    scene = constant_colors()
+    dtv.view.save_page(tmp_path / "a.html", *scene)
+    fragment, webgl.fragment = webgl.fragment, ""
+    try:
+        with webgl.scripted(hidden):
+            webgl.open(tmp_path / "a.html")
+    finally:
+        webgl.fragment = fragment
+    assert webgl.run("difftetvr.renderer") == "WebGL 2"
+    require_alike(webgl, scene, CAMERAS[:1])
+    webgl.wait_for(SETTLED)
+    assert reason in webgl.run("document.querySelector('.drawn').title + document.querySelector('.drawn').textContent")
+
+
+def test_a_page_goes_on_with_webgl_where_the_device_is_lost(webgpu, tmp_path):
+    scene = directional_colors()
+    remembered = """
+        const ask = GPUAdapter.prototype.requestDevice;
+        GPUAdapter.prototype.requestDevice = async function (...all) {
+            return (window.device = await ask.apply(this, all));
+        };
+    """
+    with webgpu.scripted(remembered):
+        opened(webgpu, tmp_path, *scene)
+    webgpu.wait_for(SETTLED)
+    webgpu.run("document.querySelector('.drawn').textContent = ''")
+    webgpu.run("device.destroy()")
+    webgpu.wait_for("difftetvr.renderer === 'WebGL 2'")
+    webgpu.wait_for(SETTLED)
+    require_alike(webgpu, scene, CAMERAS[:1])
+    assert webgpu.failure is None
+
+
+def test_a_browser_that_cannot_draw_says_so_and_shows_the_poster(browser, tmp_path):
     mesh = jittered(2, 2, 2)
     field = Field(torch.rand(mesh.num_vertices, 3), torch.rand(mesh.num_vertices))
     dtv.view.save_page(tmp_path / "a.html", mesh, field)
-    script = "HTMLCanvasElement.prototype.getContext = () => null"
-    hook = browser.call("Page.addScriptToEvaluateOnNewDocument", source=script)["identifier"]
-    browser.open(tmp_path / "a.html")
-    browser.call("Page.removeScriptToEvaluateOnNewDocument", identifier=hook)
+    with browser.scripted("HTMLCanvasElement.prototype.getContext = () => null"):
+        browser.open(tmp_path / "a.html")
     assert "no WebGL 2" in browser.failure
     is_seen = "p.complete && p.naturalWidth === 512 && !p.classList.contains('gone')"
     assert browser.run(f"(p => {is_seen})(document.querySelector('#poster'))")

@@ -219,8 +219,8 @@ def test_the_script_is_built_of_the_sources():
     if not sources.is_dir():
         pytest.skip("no sources of the script here")
     digest = hashlib.sha256()
-    for file in sorted(sources.iterdir()):
-        digest.update(f"{file.name}\n".encode() + file.read_bytes())
+    for path in sorted(file.relative_to(sources).as_posix() for file in sources.rglob("*") if file.is_file()):
+        digest.update(f"{path}\n".encode() + (sources / path).read_bytes())
     script = (ROOT / "src" / "difftetvr" / "view" / "page" / "page.js").read_text(encoding="utf-8")
     assert f"sources {digest.hexdigest()} */" in script.splitlines()[0], "run `make page`"
     assert "</script" not in script
@@ -231,7 +231,8 @@ def test_versions_of_the_tools_are_pinned_and_come_from_nowhere_in_particular():
     if not folder.is_dir():
         pytest.skip("no sources of the script here")
     wanted = json.loads((folder / "package.json").read_text())["devDependencies"]
-    assert set(wanted) == {"esbuild", "typescript"} and all(re.fullmatch(r"[\d.]+", v) for v in wanted.values())
+    assert set(wanted) == {"@webgpu/types", "esbuild", "typescript"}
+    assert all(re.fullmatch(r"[\d.]+", version) for version in wanted.values())
     locked = (folder / "package-lock.json").read_text()
     assert "resolved" not in locked and "http" not in re.sub(r'"funding":.*?}', "", locked, flags=re.DOTALL)
 

@@ -2,7 +2,7 @@ declare module "*.css" {
   const text: string;
   export default text;
 }
-declare module "*.glsl" {
+declare module "*.wgsl" {
   const text: string;
   export default text;
 }

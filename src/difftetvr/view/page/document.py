@@ -138,7 +138,7 @@ class Document:
 def save_page(
     path: str | Path, mesh: TetMesh, field: Field | ScalarField, options: PageOptions | None = None
 ) -> Document:
-    """Writes a page that shows a volume in any browser with WebGL 2: one file, no server, no network.
+    """Writes a page that shows a volume in any browser with WebGPU or WebGL 2: one file, no server, no network.
 
     Positions are rounded to 1/65536 of the mesh's longest side, to 1/2^24 where that would turn a cell inside out;
     colours and densities to half floats, scalars to as fine steps, harmonics to bytes. Pictures of it are those of

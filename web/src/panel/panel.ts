@@ -1,10 +1,10 @@
 // The panel beside the picture.
+import { STEP_BOUND } from "../drawing/audit";
+import type { Finished, Stage } from "../drawing/stage";
+import type { Orbit } from "../drawing/view";
+import type { Volume } from "../volume/payload";
 import { choice, colorInput, grouped, make, row, short, slider, tick } from "./elements";
-import type { Volume } from "./payload";
-import { type Renderer, STEP_BOUND } from "./renderer";
-import type { Finished, Stage } from "./stage";
 import { TransferEditor } from "./transfer_editor";
-import type { Orbit } from "./view";
 
 const QUALITIES = [0.5, 1, 2];
 const AXES = ["x", "y", "z"];
@@ -13,12 +13,12 @@ const AXES = ["x", "y", "z"];
 const WIDE = 700;
 const COVERED = 324;
 
-export function panelOf(volume: Volume, renderer: Renderer, stage: Stage, orbit: Orbit): HTMLElement {
+export function panelOf(volume: Volume, stage: Stage, orbit: Orbit): HTMLElement {
   const { header } = volume;
   const body = make("div", { className: "body" });
   if (header.transfer) {
     const editor = new TransferEditor(header.transfer, volume.values, (transfer) => {
-      renderer.setTransfer(transfer);
+      stage.look.transfer = transfer;
       stage.change();
     });
     body.append(section(header.scalar ?? "Scalar", editor.element));
@@ -116,10 +116,11 @@ function statistics(volume: Volume, stage: Stage): HTMLElement {
   return make("section", { className: "statistics" }, make("p", {}, size), drawn);
 }
 
-function describe({ width, height, milliseconds, audit }: Finished): string[] {
+function describe({ by, width, height, milliseconds, audit }: Finished): string[] {
   return [
     `${width} \u00d7 ${height} pixels in ${grouped(milliseconds)} ms`,
     `${grouped(audit.meanSteps)} cells a ray, at most ${grouped(audit.mostSteps)}`,
     `${grouped(audit.lost)} rays lost, ${grouped(audit.bounded)} ended at ${grouped(STEP_BOUND)} cells`,
+    `Drawn by ${by.join(". ")}`,
   ];
 }

@@ -75,7 +75,7 @@ export interface Volume {
   /** Whether the ascending order of a cell is an odd permutation of the positive one. */
   odd: Uint8Array;
   /** (N, 4) linear RGB and density; of scalars, the scalar is the last and the others are not used. */
-  values: Float32Array;
+  values: Float32Array<ArrayBuffer>;
   harmonics: Harmonics | null;
 }
 
@@ -172,7 +172,7 @@ function cellsOf(header: Header, steps: Columns, packed: Columns): { cells: Uint
   return { cells, odd };
 }
 
-function valuesOf(columns: Map<string, Columns>): Float32Array {
+function valuesOf(columns: Map<string, Columns>): Float32Array<ArrayBuffer> {
   const scalar = columns.get("scalar");
   if (scalar) {
     const values = new Float32Array(4 * scalar.entry.rows);

@@ -2,13 +2,13 @@
 
 export interface Hierarchy {
   /** (N, 8): lower corner, the node after this one's; upper corner, leaves: first face times 8 plus count, others -1. */
-  nodes: Float32Array;
+  nodes: Float32Array<ArrayBuffer>;
   /** (F, 8): vertices and apex; cell, and three that are not used. */
-  faces: Uint32Array;
+  faces: Uint32Array<ArrayBuffer>;
 }
 
 const LEAF = 3;
-// Boxes are wider than their faces by what a ray's frame moves points (see walk.glsl), many times over.
+// Boxes are wider than their faces by what a ray's frame moves points (see walk.wgsl), many times over.
 const SLACK = 4e-6;
 
 export function hierarchyOf(positions: Float32Array, boundary: Uint32Array): Hierarchy {

@@ -1,26 +1,26 @@
 // Mouse, touch and keys: what they do to the orbit.
-import type { Orbit } from "./view";
+import type { Orbit } from "../drawing/view";
 
 const KEY_ANGLE = Math.PI / 24;
 
-export function listen(canvas: HTMLCanvasElement, orbit: Orbit, changed: () => void): void {
+export function listen(surface: HTMLElement, orbit: Orbit, changed: () => void): void {
   const fingers = new Map<number, [number, number]>();
 
-  canvas.addEventListener("pointerdown", (event) => {
-    canvas.setPointerCapture(event.pointerId);
+  surface.addEventListener("pointerdown", (event) => {
+    surface.setPointerCapture(event.pointerId);
     fingers.set(event.pointerId, [event.clientX, event.clientY]);
-    canvas.classList.add("held");
+    surface.classList.add("held");
   });
   for (const name of ["pointerup", "pointercancel"] as const) {
-    canvas.addEventListener(name, (event) => {
+    surface.addEventListener(name, (event) => {
       fingers.delete(event.pointerId);
-      if (!fingers.size) canvas.classList.remove("held");
+      if (!fingers.size) surface.classList.remove("held");
     });
   }
-  canvas.addEventListener("pointermove", (event) => {
+  surface.addEventListener("pointermove", (event) => {
     const before = fingers.get(event.pointerId);
     if (!before) return;
-    const size = Math.min(canvas.clientWidth, canvas.clientHeight);
+    const size = Math.min(surface.clientWidth, surface.clientHeight);
     const now: [number, number] = [event.clientX, event.clientY];
     const step = [(now[0] - before[0]) / size, (now[1] - before[1]) / size];
     const other = [...fingers].find(([id]) => id !== event.pointerId)?.[1];
@@ -37,7 +37,7 @@ export function listen(canvas: HTMLCanvasElement, orbit: Orbit, changed: () => v
     fingers.set(event.pointerId, now);
     changed();
   });
-  canvas.addEventListener(
+  surface.addEventListener(
     "wheel",
     (event) => {
       event.preventDefault();
@@ -47,8 +47,8 @@ export function listen(canvas: HTMLCanvasElement, orbit: Orbit, changed: () => v
     },
     { passive: false },
   );
-  canvas.addEventListener("contextmenu", (event) => event.preventDefault());
-  canvas.addEventListener("keydown", (event) => {
+  surface.addEventListener("contextmenu", (event) => event.preventDefault());
+  surface.addEventListener("keydown", (event) => {
     const act = KEYS[event.key];
     if (!act || event.ctrlKey || event.metaKey || event.altKey) return;
     event.preventDefault();

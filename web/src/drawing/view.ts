@@ -1,5 +1,5 @@
 // Where the eye is, and what it sees: an orbit around a point, in the page's units (see payload.ts).
-import type { Opening, Vector } from "./payload";
+import type { Opening, Vector } from "../volume/payload";
 
 /** What one picture shows. */
 export interface View {

@@ -1,6 +1,6 @@
 // The transfer function as a curve whose knots can be dragged, added, taken away and coloured.
+import type { TransferKnots, Vector } from "../volume/payload";
 import { colorInput, hexOf, make, row, short } from "./elements";
-import type { TransferKnots, Vector } from "./payload";
 
 interface Knot {
   scalar: number;

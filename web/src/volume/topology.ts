@@ -3,7 +3,7 @@
 export interface Topology {
   /** (4 T, 2): what lies behind the face opposite each cell's r-th vertex, its cell and that one's vertex that is not on
    * the face; NONE and any vertex at the boundary. */
-  links: Uint32Array;
+  links: Uint32Array<ArrayBuffer>;
   /** (F, 5) boundary faces: vertices, counter-clockwise for who enters through them, the cell's apex, the cell. */
   boundary: Uint32Array;
 }
