@@ -19,8 +19,8 @@ class Slices:
     """The training views of a scan, slice by slice.
 
     Attributes:
-        sinograms: (N, V, W) float32 line integrals over the pitch, as if pixels had side 1: slices from the least z, views,
-            columns.
+        sinograms: (N, V, W) float32 line integrals over the pitch, as if pixels had side 1: slices from the least z up,
+            views, columns.
         weights: (N, V, W) float32 one over variances, in units of their mean; 0 where pixels do not count.
         degrees: (V,) angles at which columns run along (-sin, cos, 0).
         pitch: Side of a pixel and of a voxel, in the unit of the geometry.
@@ -41,7 +41,9 @@ class Slices:
         geometry = scan.geometry.select(scan.train)
         detector = geometry.detector
         if detector.direction is None:
-            raise CaptureError("The rays come from a source; slices need a scan whose geometry has the type 'parallel'.")
+            raise CaptureError(
+                "The rays come from a source; slices need a scan of parallel rays, such as of the type 'parallel'."
+            )
         columns, rows, center, direction = (
             part.double().expand(geometry.num_views, 3)
             for part in (detector.columns, detector.rows, detector.center, detector.direction)
@@ -63,8 +65,8 @@ class Slices:
         )
         if max(float(part.abs().max()) for part in wrong) > _EQUAL * detector.width:
             raise CaptureError(
-                "Slices need square pixels as wide as the voxels, as many rows as a cube of N^3 voxels has slices, and an "
-                "upright detector whose middle and the box's are on the axis; make such a geometry."
+                "Slices need square pixels as wide as the voxels, as many rows as a cube of N^3 voxels has slices, and "
+                "an upright detector whose middle and the box's are on the axis; make such a geometry."
             )
         views, height, width = geometry.shape
 
@@ -85,9 +87,9 @@ class Slices:
         return int(self.sinograms.shape[2])
 
     def volume(self, slices: np.ndarray) -> torch.Tensor:
-        """Flat densities in the unit of the geometry, x fastest, of (N, M, M) slices whose axes are x and y; M >= N.
+        """Flat densities in the unit of the geometry, x fastest, of (N, M, M) slices whose axes are x and y.
 
-        Slices are cut around the middle voxel, or the middle between voxels.
+        M is N or greater by an even number: what is around the middle N x N is cut off.
         """
         first = (slices.shape[1] - self.size) // 2
         cut = slices[:, first : first + self.size, first : first + self.size]
