@@ -102,7 +102,8 @@ def rows_of(bench: Bench, options: argparse.Namespace) -> Iterator[tuple[Row, to
     backprojection = "FBP" if scan.geometry.detector.source is None else "FDK"
     for size in options.sizes:
         for cutoff in options.cutoffs if "fdk" in options.rows else ():
-            yield bench.row(f"{backprojection}, Hann to {cutoff:g}", size, partial(feldkamp, scan, size, Feldkamp(cutoff)))
+            make = partial(feldkamp, scan, size, Feldkamp(cutoff))
+            yield bench.row(f"{backprojection}, Hann to {cutoff:g}", size, make)
         if "sart" in options.rows:
             yield bench.row("OS-SART", size, partial(sart, scan, size, Sart(), watch))
         for weight in options.tv if "tv" in options.rows else ():
