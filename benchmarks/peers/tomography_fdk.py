@@ -1,4 +1,4 @@
-"""Feldkamp's filtered backprojection for a source on a circle around z (Dr.Jit, torch.fft).
+"""Filtered backprojection: Feldkamp's for a source on a circle around z, and that of parallel rays (Dr.Jit, torch.fft).
 
 Source: Feldkamp, Davis and Kress, "Practical cone-beam algorithm", J. Opt. Soc. Am. A 1 (1984).
 """
@@ -32,45 +32,84 @@ class Feldkamp:
     cutoff: float = 0.3
 
 
+@dataclass(frozen=True)
+class _Views:
+    """What backprojection needs to know of V views.
+
+    Attributes:
+        cosine: (V, H, W) of the angle between each ray and its view's middle one; a number if it is one for all.
+        weight: (V,) of filtered projections for pixels of size 1.
+        table: (V, 12) see `_table`.
+    """
+
+    cosine: torch.Tensor | float
+    weight: torch.Tensor
+    table: torch.Tensor
+
+
 def feldkamp(scan: VoxelScan, size: int, options: Feldkamp) -> torch.Tensor:
     """(N^3) densities of the training views, at least 0."""
     geometry = scan.geometry.select(scan.train)
-    center, source, columns, rows = _vectors(geometry)
+    views = _parallel_views(geometry) if geometry.detector.source is None else _cone_views(geometry)
+    height, width = geometry.shape[1:]
+    values = scan.measured[scan.train].reshape(-1, height, width).double() * views.cosine
+    values = _filtered(values, options.cutoff) * views.weight[:, None, None]
+    lower, upper = geometry.bounds
+    sides = (upper - lower) / size
+    # From places in the world to numbers of voxels.
+    table = views.table.reshape(-1, 3, 4)
+    table[..., 3] += table[..., :3] @ (lower + 0.5 * sides)
+    table[..., :3] *= sides
+    return _backprojected(values.float(), table.reshape(-1, _NUMBERS).float(), size).clamp_min_(0.0)
+
+
+def _cone_views(geometry: ProjectionGeometry) -> _Views:
+    detector = geometry.detector
+    assert detector.source is not None
+    center, source, columns, rows = (
+        part.expand(geometry.num_views, 3)
+        for part in (detector.center, detector.source, detector.columns, detector.rows)
+    )
     height, width = geometry.shape[1:]
     radius, distance = source[:, :2].norm(dim=1), (center - source).norm(dim=1)
     if float(radius.max() - radius.min()) > _EQUAL * float(radius.max()):
         raise CaptureError("The sources stand on no circle around the z axis, so Feldkamp's method does not apply.")
-    gaps = _gaps(torch.atan2(source[:, 1], source[:, 0]))
     across, down = columns.norm(dim=1), rows.norm(dim=1)
     x = (torch.arange(width) + 0.5 - 0.5 * width).double()
     y = (torch.arange(height) + 0.5 - 0.5 * height).double()
     place = center[:, None, None] + x[:, None] * columns[:, None, None] + y[:, None, None] * rows[:, None, None]
     cosine = distance[:, None, None] / (place - source[:, None, None]).norm(dim=-1)
     step = across * radius / distance  # of the pixels where they are seen on the axis
-    values = scan.measured[scan.train].reshape(-1, height, width).double() * cosine
-    values = _filtered(values, options.cutoff) / step[:, None, None]
-    values *= (0.5 * gaps * radius**2)[:, None, None]
-    lower, upper = geometry.bounds
-    sides = (upper - lower) / size
+    weight = 0.5 * _gaps(torch.atan2(source[:, 1], source[:, 0]), 2.0 * math.pi) * radius**2 / step
     table = _table(center, source, columns / across[:, None] ** 2, rows / down[:, None] ** 2, (height, width))
-    # From places in the world to numbers of voxels.
-    table = table.reshape(-1, 3, 4)
-    table[..., 3] += table[..., :3] @ (lower + 0.5 * sides)
-    table[..., :3] *= sides
-    return _backprojected(values.float(), table.reshape(-1, _NUMBERS).float(), size).clamp_min_(0.0)
+    return _Views(cosine, weight, table)
 
 
-def _vectors(geometry: ProjectionGeometry) -> tuple[torch.Tensor, ...]:
+def _parallel_views(geometry: ProjectionGeometry) -> _Views:
+    """Half a turn sees all there is to see, and what is far is seen as large as what is near."""
     detector = geometry.detector
-    if detector.source is None:
-        raise CaptureError("The rays are parallel, so Feldkamp's method does not apply.")
-    parts = (detector.center, detector.source, detector.columns, detector.rows)
-    return tuple(part.expand(geometry.num_views, 3) for part in parts)
+    assert detector.direction is not None
+    center, direction, columns, rows = (
+        part.expand(geometry.num_views, 3)
+        for part in (detector.center, detector.direction, detector.columns, detector.rows)
+    )
+    across, down = columns.norm(dim=1, keepdim=True), rows.norm(dim=1, keepdim=True)
+    unit, normal = direction / direction.norm(dim=1, keepdim=True), torch.linalg.cross(columns, rows)
+    skew = torch.linalg.cross(unit, normal / normal.norm(dim=1, keepdim=True))
+    if max(float(part.abs().max()) for part in (unit[:, 2], columns[:, 2] / across[:, 0], skew)) > _EQUAL:
+        raise CaptureError("The parallel rays do not run across z and an upright detector; backprojection needs that.")
+    numbers = torch.zeros(geometry.num_views, 3, 4, dtype=torch.float64)
+    for k, (along, pixels) in enumerate(((columns / across**2, detector.width), (rows / down**2, detector.height))):
+        numbers[:, k, :3] = along
+        numbers[:, k, 3] = 0.5 * pixels - 0.5 - (center * along).sum(1)
+    numbers[:, 2, 3] = 1.0
+    weight = _gaps(torch.atan2(direction[:, 1], direction[:, 0]), math.pi) / across[:, 0]
+    return _Views(1.0, weight, numbers.reshape(-1, _NUMBERS))
 
 
-def _gaps(angles: torch.Tensor) -> torch.Tensor:
-    """(V,) half the angles between each view's neighbours, for views all around."""
-    turn = 2.0 * math.pi
+def _gaps(angles: torch.Tensor, turn: float) -> torch.Tensor:
+    """(V,) half the angles between each view's neighbours, for views all around a turn after which all repeats."""
+    angles = torch.remainder(angles, turn)
     order = torch.argsort(angles)
     sorted_angles = angles[order]
     after = torch.remainder(sorted_angles.roll(-1) - sorted_angles, turn)

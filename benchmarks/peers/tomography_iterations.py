@@ -1,7 +1,8 @@
 """Voxels by iterations over ordered subsets of views: OS-SART, and weighted least squares with total variation.
 
-Both begin with N / 2 voxels a side on projections of half the resolution. What their options should be is judged by
-held-out projections alone: OS-SART keeps the iterate that predicts them best, and the options of either are chosen so.
+Both begin with N / 2 voxels a side, rounded up, on projections of half the resolution. What their options should be is
+judged by held-out projections alone: OS-SART keeps the iterate that predicts them best, and the options of either are
+chosen so.
 
 Sources: Andersen and Kak, "Simultaneous algebraic reconstruction technique (SART)", Ultrasonic Imaging 6 (1984); Kim,
 Ramani and Fessler, "Combining ordered subsets and momentum for accelerated X-ray CT image reconstruction", IEEE TMI 34
@@ -126,21 +127,19 @@ def variational(scan: VoxelScan, size: int, options: Variational, watch: Watch) 
 def _coarse_to_fine(
     scan: VoxelScan, size: int, level: Callable[[torch.Tensor, VoxelScan, VoxelProjector], torch.Tensor]
 ) -> torch.Tensor:
-    """Begin with few voxels and pixels, and double both."""
-    halvings = 0
-    while size % 2 ** (halvings + 1) == 0 and size // 2 ** (halvings + 1) >= _COARSEST:
-        halvings += 1
-    volume = torch.zeros((size // 2**halvings) ** 3)
-    for k in range(halvings, -1, -1):
+    """Begin with few voxels and pixels, and double both, or nearly so where numbers are odd."""
+    sizes = [size]
+    while (half := -(-sizes[0] // 2)) >= _COARSEST:
+        sizes.insert(0, half)
+    volume = torch.zeros(sizes[0] ** 3)
+    for k, count in zip(range(len(sizes) - 1, -1, -1), sizes, strict=True):
         coarse = scan if k == 0 else VoxelScan.of(binned(scan.capture, 2**k))
-        projector = VoxelProjector(coarse.geometry, size // 2**k)
-        volume = level(volume, coarse, projector)
-        if k:
-            volume = doubled(volume, projector.size)
+        volume = resized(volume, round(volume.numel() ** (1 / 3)), count)
+        volume = level(volume, coarse, VoxelProjector(coarse.geometry, count))
     return volume
 
 
-def doubled(volume: torch.Tensor, size: int) -> torch.Tensor:
-    """Voxels of half the side, with the trilinear values at their middles."""
+def resized(volume: torch.Tensor, size: int, count: int) -> torch.Tensor:
+    """``count``^3 voxels in the place of ``size``^3, with the trilinear values at their middles."""
     cube = volume.reshape(1, 1, size, size, size)
-    return torch.nn.functional.interpolate(cube, scale_factor=2, mode="trilinear", align_corners=False).reshape(-1)
+    return torch.nn.functional.interpolate(cube, (count,) * 3, mode="trilinear", align_corners=False).reshape(-1)

@@ -1,4 +1,4 @@
-"""Voxels from the projections that meshes are fitted to: FDK, OS-SART, and least squares with total variation.
+"""Voxels from the projections that meshes are fitted to: FDK or FBP, OS-SART, and least squares with total variation.
 
 python benchmarks/peers/tomography_voxels.py SCAN [--truth VOLUME] [--sizes 128 256] [--rows fdk sart tv blurred]
     [--holdout-every N] [--bin N] [--tv 0.00625 ...] [--cutoffs 0.3 ...] [--csv FILE] [--keep FOLDER]
@@ -99,9 +99,11 @@ def cpu_seconds() -> float:
 def rows_of(bench: Bench, options: argparse.Namespace) -> Iterator[tuple[Row, torch.Tensor]]:
     """All rows that are asked for, one after another."""
     scan, watch = bench.scan, bench.watch
+    backprojection = "FBP" if scan.geometry.detector.source is None else "FDK"
     for size in options.sizes:
         for cutoff in options.cutoffs if "fdk" in options.rows else ():
-            yield bench.row(f"FDK, Hann to {cutoff:g}", size, partial(feldkamp, scan, size, Feldkamp(cutoff)))
+            make = partial(feldkamp, scan, size, Feldkamp(cutoff))
+            yield bench.row(f"{backprojection}, Hann to {cutoff:g}", size, make)
         if "sart" in options.rows:
             yield bench.row("OS-SART", size, partial(sart, scan, size, Sart(), watch))
         for weight in options.tv if "tv" in options.rows else ():
