@@ -33,7 +33,7 @@ from rich.console import Console
 from tomography_projector import VoxelProjector
 from tomography_scan import VoxelScan
 from tomography_slices import Slices
-from tomography_voxels import Bench, Row, table_of, write_csv
+from tomography_voxels import Bench, Row, print_rows
 
 from difftetvr.capture import ProjectionCapture, load_volume
 from difftetvr.errors import CaptureError, DiffTetError
@@ -164,17 +164,7 @@ def main() -> None:
     truth = None if options.truth is None else load_volume(options.truth).values
     capture = ProjectionCapture.load(options.scan, options.holdout_every)
     bench = Bench(capture, truth, lambda line: console.print(line, highlight=False))
-    rows = []
-    for row, volume in rows_of(bench, options):
-        rows.append(row)
-        if options.csv is not None:
-            write_csv(options.csv, rows)
-        if options.keep is not None:
-            options.keep.mkdir(parents=True, exist_ok=True)
-            name = f"{row.method.replace(',', '').replace(' ', '-')}-{row.size}.npy"
-            np.save(options.keep / name, volume.reshape([row.size] * 3).numpy().T)
-    views = f"{len(bench.scan.train)} views to learn from, {len(bench.scan.test)} held out"
-    console.print(table_of(rows, f"{options.scan}: {views}"))
+    print_rows(bench, rows_of(bench, options), options, console)
 
 
 if __name__ == "__main__":

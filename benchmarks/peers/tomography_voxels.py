@@ -19,7 +19,7 @@ import csv
 import math
 import resource
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -131,6 +131,23 @@ def write_csv(path: Path, rows: list[Row]) -> None:
         writer.writerows(asdict(row) for row in rows)
 
 
+def print_rows(
+    bench: Bench, found: Iterable[tuple[Row, torch.Tensor]], options: argparse.Namespace, console: Console
+) -> None:
+    """Print rows as one table, and write them and their volumes as they come where `--csv` and `--keep` say so."""
+    rows = []
+    for row, volume in found:
+        rows.append(row)
+        if options.csv is not None:
+            write_csv(options.csv, rows)
+        if options.keep is not None:
+            options.keep.mkdir(parents=True, exist_ok=True)
+            name = f"{row.method.replace(',', '').replace(' ', '-')}-{row.size}.npy"
+            np.save(options.keep / name, volume.reshape([row.size] * 3).numpy().T)
+    views = f"{len(bench.scan.train)} views to learn from, {len(bench.scan.test)} held out"
+    console.print(table_of(rows, f"{options.scan}: {views}"))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scan")
@@ -149,17 +166,7 @@ def main() -> None:
     truth = None if options.truth is None else load_volume(options.truth).values
     console = Console()
     bench = Bench(capture, truth, lambda line: console.print(line, highlight=False))
-    rows = []
-    for row, volume in rows_of(bench, options):
-        rows.append(row)
-        if options.csv is not None:
-            write_csv(options.csv, rows)
-        if options.keep is not None:
-            options.keep.mkdir(parents=True, exist_ok=True)
-            name = f"{row.method.replace(',', '').replace(' ', '-')}-{row.size}.npy"
-            np.save(options.keep / name, volume.reshape([row.size] * 3).numpy().T)
-    views = f"{len(bench.scan.train)} views to learn from, {len(bench.scan.test)} held out"
-    console.print(table_of(rows, f"{options.scan}: {views}"))
+    print_rows(bench, rows_of(bench, options), options, console)
 
 
 if __name__ == "__main__":
