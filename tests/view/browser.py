@@ -96,9 +96,8 @@ class Browser:
 
     def open(self, page: Path) -> None:
         """Opens a page and waits until its script has begun."""
-        # From elsewhere: to go to the address of the page that is open, with a fragment, would load nothing.
-        self.call("Page.navigate", url="about:blank")
-        self.call("Page.navigate", url=page.resolve().as_uri() + self.fragment)
+        # An address of its own: to go to that of the page that is open, with a fragment, would load nothing.
+        self.call("Page.navigate", url=f"{page.resolve().as_uri()}?{self._count}{self.fragment}")
         self.wait_for("window.difftetvr || document.querySelector('.failure')")
 
     def visit(self, address: str) -> None:

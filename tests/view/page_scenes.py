@@ -97,4 +97,5 @@ def require_webgpu(browser: Browser, folder: Path) -> None:
 
 def require_no_complaints(browser: Browser) -> None:
     """Nothing in the log, and nothing asked of a network."""
-    assert not browser.errors and all(r.startswith(("file:", "data:", "blob:")) for r in browser.requests)
+    assert not browser.errors, browser.errors
+    assert not [r for r in browser.requests if not r.startswith(("file:", "data:", "blob:"))]

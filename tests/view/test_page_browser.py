@@ -16,7 +16,6 @@ from view.page_scenes import (
     constant_scalars,
     directional_colors,
     jittered,
-    psnr,
     require_alike,
     require_no_complaints,
     require_webgpu,
@@ -161,61 +160,6 @@ def test_what_hands_do(browser, tmp_path):
     # Without what the panel covers, in the quality Fast.
     assert browser.run(size) == ["image/png", round((700 - 324) / 2), 150]
     browser.resize(720, 480)
-
-
-def test_both_renderers_draw_the_same(webgl, webgpu, tmp_path):
-    scene = scalars_with_a_jump()
-    pictures = []
-    for browser in (webgl, webgpu):
-        opened(browser, tmp_path, *scene)
-        pictures.append(require_alike(browser, scene, CAMERAS))
-    for one, other in zip(*pictures, strict=True):
-        assert psnr(one, other) > 50.0
-
-
-@pytest.mark.parametrize(
-    ("hidden", "reason"),
-    [
-        ("Object.defineProperty(navigator, 'gpu', { value: undefined })", "This browser has no WebGPU."),
-        (
-            "Object.defineProperty(navigator, 'gpu', { value: { requestAdapter: async () => null } })",
-            "WebGPU finds no graphics card here.",
-        ),
-    ],
-    ids=["no-webgpu", "no-adapter"],
-)
-def test_where_there_is_no_webgpu_webgl_draws(webgl, tmp_path, hidden, reason):
-    scene = constant_colors()
-    dtv.view.save_page(tmp_path / "a.html", *scene)
-    fragment, webgl.fragment = webgl.fragment, ""
-    try:
-        with webgl.scripted(hidden):
-            webgl.open(tmp_path / "a.html")
-    finally:
-        webgl.fragment = fragment
-    assert webgl.run("difftetvr.renderer") == "WebGL 2"
-    require_alike(webgl, scene, CAMERAS[:1])
-    webgl.wait_for(SETTLED)
-    assert reason in webgl.run("document.querySelector('.drawn').title + document.querySelector('.drawn').textContent")
-
-
-def test_a_page_goes_on_with_webgl_where_the_device_is_lost(webgpu, tmp_path):
-    scene = directional_colors()
-    remembered = """
-        const ask = GPUAdapter.prototype.requestDevice;
-        GPUAdapter.prototype.requestDevice = async function (...all) {
-            return (window.device = await ask.apply(this, all));
-        };
-    """
-    with webgpu.scripted(remembered):
-        opened(webgpu, tmp_path, *scene)
-    webgpu.wait_for(SETTLED)
-    webgpu.run("document.querySelector('.drawn').textContent = ''")
-    webgpu.run("device.destroy()")
-    webgpu.wait_for("difftetvr.renderer === 'WebGL 2'")
-    webgpu.wait_for(SETTLED)
-    require_alike(webgpu, scene, CAMERAS[:1])
-    assert webgpu.failure is None
 
 
 def test_a_browser_that_cannot_draw_says_so_and_shows_the_poster(browser, tmp_path):
