@@ -11,7 +11,9 @@ from __future__ import annotations
 import argparse
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -26,7 +28,8 @@ from view.browser import CHROMIUM, WEBGPU_OPTIONS, Browser, rendered  # noqa: E4
 
 BACKGROUND = (0.2, 0.4, 0.6)  # of which 8 bits hold each exactly
 DIRECTIONS = ((0.45, -1.0, 0.35), (-1.1, 0.7, 0.4), (0.1, 0.05, 0.03))  # in longest sides from the middle
-Scene = tuple[str, Callable[[], tuple[dtv.TetMesh, dtv.Field | dtv.ScalarField]]]
+Field = dtv.Field | dtv.ScalarField
+Scene = tuple[str, Callable[[], tuple[dtv.TetMesh, Field]]]
 
 
 def simulation(path: Path, scalar: str, function: dtv.TransferFunction) -> tuple[dtv.TetMesh, dtv.ScalarField]:
@@ -60,22 +63,49 @@ def cameras(mesh: dtv.TetMesh) -> Iterator[dtv.Camera]:
         yield dtv.Camera.look_at(eye, center, (0.0, 0.0, 1.0), 0.9, 320, 240)
 
 
-def drawn_by(
-    browser: Browser, page: Path, mesh: dtv.TetMesh, field: dtv.Field | dtv.ScalarField
-) -> tuple[float, list[dict[str, float]]]:
-    """Least PSNR of a page's pictures in a browser, and what happened to their rays."""
+@dataclass
+class Drawn:
+    """What a browser makes of a page: its pictures, least PSNR (dB), what happened to rays, mean milliseconds."""
+
+    pictures: list[torch.Tensor]
+    ratio: float
+    audits: list[dict[str, float]]
+    milliseconds: float
+
+
+def drawn_by(browser: Browser, page: Path, views: list[dtv.Camera], truths: list[torch.Tensor]) -> Drawn:
+    """Draws some views, each twice, so that the time is that of drawing alone."""
     browser.open(page)
     names = {"#webgl": "WebGL 2", "#webgpu": "WebGPU"}
     if browser.run("difftetvr.renderer") != names[browser.fragment]:
         sys.exit(f"This Chromium has no {names[browser.fragment]} to offer.")
-    ratios, audits = [], []
-    for camera in cameras(mesh):
+    browser.wait_for("/pixels in/.test(document.querySelector('.drawn').textContent)")  # it rests
+    pictures, audits, seconds = [], [], 0.0
+    for camera in views:
+        rendered(browser, camera, BACKGROUND)
+        began = time.perf_counter()
         pixels, audit = rendered(browser, camera, BACKGROUND)
-        with torch.no_grad():
-            truth = dtv.render(mesh, field, camera, torch.tensor(BACKGROUND)).color.clamp(0.0, 1.0)
-        ratios.append(psnr(torch.from_numpy(pixels).float(), truth))
+        seconds += time.perf_counter() - began
+        pictures.append(torch.from_numpy(pixels).float())
         audits.append(audit)
-    return min(ratios), audits
+    ratio = min(psnr(picture, truth) for picture, truth in zip(pictures, truths, strict=True))
+    return Drawn(pictures, ratio, audits, 1000.0 * seconds / len(views))
+
+
+def row_of(name: str, page: Path, mesh: dtv.TetMesh, field: Field, browsers: list[Browser]) -> str:
+    """Of the table."""
+    text = dtv.view.save_page(page, mesh, field).text
+    views = list(cameras(mesh))
+    with torch.no_grad():
+        background = torch.tensor(BACKGROUND)
+        truths = [dtv.render(mesh, field, view, background).color.clamp(0.0, 1.0) for view in views]
+    gl, gpu = (drawn_by(browser, page, views, truths) for browser in browsers)
+    apart = sum(int((a != b).any(dim=-1).sum()) for a, b in zip(gl.pictures, gpu.pictures, strict=True))
+    audits = gl.audits + gpu.audits
+    most, lost = max(a["mostSteps"] for a in audits), sum(a["lost"] + a["bounded"] for a in audits)
+    ratios = f"{gl.ratio:.1f} | {gpu.ratio:.1f} | {apart}"
+    times = f"{gl.milliseconds:.0f} | {gpu.milliseconds:.0f}"
+    return f"| {name} | {mesh.num_cells} | {len(text) / 1e6:.2f} | {ratios} | {most} | {lost} | {times} |"
 
 
 def main() -> None:
@@ -85,21 +115,16 @@ def main() -> None:
     options = parser.parse_args()
     if CHROMIUM is None:
         sys.exit("There is no Chromium here, in which pages could be drawn.")
-    print("| volume | cells | page (MB) | least PSNR (dB), WebGL 2 | WebGPU | most cells of a ray | rays lost |")
-    print("|---|---|---|---|---|---|---|")
+    print("| volume | cells | page (MB) | least PSNR (dB), WebGL 2 | WebGPU | pixels that differ ", end="")
+    print("| most cells of a ray | rays lost | ms a picture, WebGL 2 | WebGPU |")
+    print("|---|---|---|---|---|---|---|---|---|---|")
     with (
         tempfile.TemporaryDirectory() as folder,
         Browser(fragment="#webgl") as webgl,
         Browser(options=WEBGPU_OPTIONS, fragment="#webgpu") as webgpu,
     ):
         for name, make in scenes(options.models, options.meshes):
-            mesh, field = make()
-            page = dtv.view.save_page(Path(folder) / "a.html", mesh, field)
-            (gl, audits), (gpu, others) = (drawn_by(b, Path(folder) / "a.html", mesh, field) for b in (webgl, webgpu))
-            audits += others
-            most, lost = max(a["mostSteps"] for a in audits), sum(a["lost"] + a["bounded"] for a in audits)
-            size = len(page.text) / 1e6
-            print(f"| {name} | {mesh.num_cells} | {size:.2f} | {gl:.1f} | {gpu:.1f} | {most} | {lost} |", flush=True)
+            print(row_of(name, Path(folder) / "a.html", *make(), [webgl, webgpu]), flush=True)
 
 
 if __name__ == "__main__":
