@@ -88,7 +88,7 @@ def exchanged(mesh: TetMesh, seed: int) -> TetMesh:
     return collapse_edges(mesh, edges, torch.zeros_like(edges), cost, limit=60).mesh
 
 
-def cameras(eye: tuple[float, float, float]) -> Camera:
+def camera_at(eye: tuple[float, float, float]) -> Camera:
     return Camera.look_at(eye, (0, 0, 0), width=24, height=16)
 
 
@@ -99,15 +99,15 @@ def rays_from_many_places() -> Rays:
 
 OUTSIDE, INSIDE = (2.5, 2.0, 1.5), (0.1, 0.05, 0.2)
 VIEWS: dict[str, tuple[Callable[[], Camera | Rays], str]] = {
-    "outside": (lambda: cameras(OUTSIDE), "marching"),
-    "inside": (lambda: cameras(INSIDE), "marching"),
-    "rays-outside": (lambda: cameras(OUTSIDE).rays(), "marching"),
-    "rays-inside": (lambda: cameras(INSIDE).rays(), "marching"),
+    "outside": (lambda: camera_at(OUTSIDE), "marching"),
+    "inside": (lambda: camera_at(INSIDE), "marching"),
+    "rays-outside": (lambda: camera_at(OUTSIDE).rays(), "marching"),
+    "rays-inside": (lambda: camera_at(INSIDE).rays(), "marching"),
     "rays-anywhere": (rays_from_many_places, "marching"),
-    "lists-outside": (lambda: cameras(OUTSIDE), "linked-list"),
-    "lists-inside": (lambda: cameras(INSIDE), "linked-list"),
+    "lists-outside": (lambda: camera_at(OUTSIDE), "linked-list"),
+    "lists-inside": (lambda: camera_at(INSIDE), "linked-list"),
     "lists-of-rays": (rays_from_many_places, "linked-list"),
-    "projected": (lambda: cameras(OUTSIDE), "projected"),
+    "projected": (lambda: camera_at(OUTSIDE), "projected"),
 }
 
 

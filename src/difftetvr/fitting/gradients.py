@@ -53,15 +53,16 @@ class ViewGradients:
         before = mesh.vertices.grad  # of earlier iterations, in which all processes have a part already
         for leaf in leaves:
             leaf.grad = None
-        if self.cameras is not None:
-            self.cameras.curvature.zero_()
         weight = 1.0 / len(views)
-        own = [self._accumulate(mesh, view, iteration, weight) for view in self.processes.share(views)]
+        moving = self.cameras if self.cameras is not None and self.cameras.motion.requires_grad else None
+        if moving is not None:
+            moving.curvature.zero_()
+        own = [self._accumulate(mesh, view, iteration, weight, moving) for view in self.processes.share(views)]
         gradients = [torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for leaf in leaves]
         for leaf, gradient in zip(leaves, self.processes.sum(gradients), strict=True):
             leaf.grad = gradient
-        if self.cameras is not None:
-            self.cameras.curvature = self.processes.sum(self.cameras.curvature)
+        if moving is not None:
+            moving.curvature = self.processes.sum(moving.curvature)
         if before is not None and mesh.vertices.grad is not None:
             mesh.vertices.grad = before + mesh.vertices.grad
         return [reduce(add, values) / len(views) for values in zip(*self._of_all(own, len(views)), strict=True)]
@@ -83,8 +84,10 @@ class ViewGradients:
                 total += gradient.abs().sum(1)
         return total
 
-    def _accumulate(self, mesh: TetMesh, view: int, iteration: int, weight: float) -> list[torch.Tensor]:
-        """Adds a view's gradient; returns its loss and mean squared error."""
+    def _accumulate(
+        self, mesh: TetMesh, view: int, iteration: int, weight: float, moving: RefinedCameras | None = None
+    ) -> list[torch.Tensor]:
+        """Adds a view's gradient, and its curvature to cameras that move by it; returns loss and mean squared error."""
         background: Color = self.config.background_at(iteration)
         truth = self.truth.image(view, background).to(mesh.vertices.device)
         seen = render(
@@ -95,10 +98,10 @@ class ViewGradients:
             deterministic=self.config.deterministic,
         )
         image, share = self.truth.where_valid(view, seen.color, truth), self.truth.counted_share(view)
-        if self.cameras is not None:
+        if moving is not None:
             weights = WEIGHTS[self.config.loss](image.detach() - truth) * (weight / (truth.numel() * share))
             weights = self.truth.where_valid(view, weights, torch.zeros_like(weights))
-            self.cameras.note_curvature(view, seen, weights)
+            moving.note_curvature(view, seen, weights)
         loss = LOSSES[self.config.loss](image, truth) / share
         if self.config.sparsity:
             loss = loss + self.config.sparsity * sparsity(self.parameters.density)

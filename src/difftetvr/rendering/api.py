@@ -20,7 +20,6 @@ from difftetvr.rendering.cell_features import CellFeatures
 from difftetvr.rendering.preparation import ViewOptions, as_rays, is_plain, prepare_view
 from difftetvr.rendering.rays import Rays, RaySource
 from difftetvr.rendering.scalar_field import ScalarField
-from difftetvr.rendering.viewpoints import Viewpoint
 
 _HALF, _OPAQUE = math.log(2.0), 1e3
 """Optical depths of opacity 1/2, and at which the transmittance is 0 in every precision."""
@@ -238,12 +237,13 @@ def _render(
     if view.task.backend.dtype != mesh.vertices.dtype:
         pixels = tuple(part.to(mesh.vertices.dtype) for part in pixels)
     image = RenderedImage(*pixels)
-    if isinstance(camera, Rays) and isinstance(field, Field) and field.harmonics is not None:
+    if view.viewpoint is not None:
+        assert isinstance(field, Field)
 
         def image_of(other: Field) -> torch.Tensor:
             return _render(mesh, other, camera, None, options, clip_plane).color.reshape(-1, len(other.color[0]))
 
-        seen = Viewpoint.of(mesh, camera).with_derivatives_of_rays(image.color, mesh, field, image_of)
+        seen = view.viewpoint.with_derivatives_of_rays(image.color, mesh, field, image_of)
         image = replace(image, color=seen)
     return image.reshaped(*view.shape)
 

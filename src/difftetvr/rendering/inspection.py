@@ -65,7 +65,7 @@ def inspect_rays(
     # A field per cell makes the smallest vertex records; its only channel carries the quality.
     field = Field(quality[:, None], torch.zeros_like(quality), "cell")
     view = prepare_view(mesh, field, camera, ViewOptions(renderer=renderer), clip_plane)
-    if not math.prod(view.shape):
+    if 0 in view.shape:
         empty = quality.new_zeros(view.shape)
         return RayStatistics(empty.int(), empty)
     backend, rays = view.task.backend, math.prod(view.shape)

@@ -59,6 +59,7 @@ class PreparedView:
         rays: The rays as kernels read them.
         upload: What was sent to kernels.
         laid_out: What they made of it.
+        viewpoint: What colours were seen from that depend on the direction; None where they do not.
     """
 
     task: RenderTask
@@ -72,6 +73,7 @@ class PreparedView:
     rays: KernelRays
     upload: Upload
     laid_out: LaidOut
+    viewpoint: Viewpoint | None = None
 
     def tracer(self, limits: torch.Tensor | None) -> Tracer:
         """What crosses the mesh along the rays, between (N, 2) limits, which may lie behind those of the view."""
@@ -105,7 +107,8 @@ def prepare_view(
     options = _checked(mesh, field, camera, options)
     require_own_threads()  # here already, since in a copy of a process torch may hang, too
     source = camera.relative_to(mesh.origin) if is_plain(camera) else as_rays(camera)
-    content, parts = _content(mesh, field, source)
+    field, viewpoint = _seen(mesh, field, source)
+    content, parts = _content(mesh, field)
     for tensor in parts:
         if tensor.device != mesh.vertices.device:
             raise MeshError(
@@ -140,10 +143,10 @@ def prepare_view(
     if task.renderer == "marching":
         mesh.topology.cell_adjacency  # noqa: B018  refuses loose cells, which have none
     view = _laid_out(task, shape, passed, bundle)
-    if _is_common(view):
-        return view
-    task, passed = _uncommon(task, passed)
-    return _laid_out(task, shape, passed, bundle)
+    if not _is_common(view):
+        task, passed = _uncommon(task, passed)
+        view = _laid_out(task, shape, passed, bundle)
+    return view if viewpoint is None else replace(view, viewpoint=viewpoint)
 
 
 @dataclass(frozen=True)
@@ -238,21 +241,27 @@ def as_rays(camera: RaySource | Rays) -> Rays:
     return camera if isinstance(camera, Rays) else camera.rays()
 
 
-def _content(
+def _seen(
     mesh: TetMesh, field: Field | ScalarField | CellFeatures, camera: Camera | Rays
-) -> tuple[Content, tuple[torch.Tensor, ...]]:
+) -> tuple[Field | ScalarField | CellFeatures, Viewpoint | None]:
+    """A field without harmonics, as it is seen from a camera or along rays, and from where that is."""
+    if not isinstance(field, Field) or field.harmonics is None:
+        return field, None
+    field.validate(mesh)
+    viewpoint = Viewpoint.of(mesh, camera)
+    return viewpoint.seen(field, mesh), viewpoint
+
+
+def _content(mesh: TetMesh, field: Field | ScalarField | CellFeatures) -> tuple[Content, tuple[torch.Tensor, ...]]:
     """What the volume holds, and its tensors as they are."""
     location = field.location_on(mesh)
     if isinstance(field, CellFeatures):
-        content, medium = _content(mesh, field.without_colours(), camera)
+        content, medium = _content(mesh, field.without_colours())
         return content, (field.features, *(medium if content == "scalar" else medium[1:]))
     if isinstance(field, ScalarField):
         if location == "vertex":
             return "scalar", (field.normalised(), *field.knots(mesh.vertices))
         field = field.as_field()
-    if field.harmonics is not None:
-        field.validate(mesh)
-        field = Viewpoint.of(mesh, camera).seen(field, mesh)
     return location, (field.color, field.density)
 
 

@@ -9,7 +9,7 @@ import torch
 
 from difftetvr.mesh import TetMesh
 from difftetvr.rendering.clip_plane import clip_rays
-from difftetvr.rendering.rays import Rays, short_unit_vectors, unit_vectors
+from difftetvr.rendering.rays import Rays, are_one, short_unit_vectors, unit_vectors
 
 KNOW_FLOAT64 = ("cpu", "cuda")
 """Devices that compute in float64."""
@@ -61,7 +61,8 @@ class PreparedRays:
             away = torch.minimum(shift - near, far - (1.0 + 1e-5) * shift.abs())
             sees_all = away.amin() >= 1.001 * radius if len(away) else away.new_ones((), dtype=torch.bool)
             sees_all = bool(sees_all) if device.type == "cpu" else sees_all
-        begins_at_point = device.type == "cpu" and not sees_all and _are_one(origins, directions, near)
+        may_begin_inside = device.type == "cpu" and not sees_all
+        begins_at_point = may_begin_inside and are_one(origins.detach() + (near[:, None] * directions).detach())
         return PreparedRays(lines, shift, near, far, sees_all, begins_at_point)
 
     def limits(self, unit: float) -> torch.Tensor | None:
@@ -76,10 +77,3 @@ class PreparedRays:
         if unit != 1.0:
             lines = lines * lines.new_tensor([1.0 / unit] * 3 + [1.0] * 3)
         return replace(self, lines=lines.to(dtype))
-
-
-@torch.no_grad()
-def _are_one(origins: torch.Tensor, directions: torch.Tensor, near: torch.Tensor) -> bool:
-    """Whether the points at some distances along lines are one."""
-    begin = origins + near[:, None] * directions
-    return bool((begin == begin[:1]).all())

@@ -193,6 +193,12 @@ def one_vector(vectors: torch.Tensor) -> torch.Tensor | None:
     return vectors[(0,) * len(sizes)]
 
 
+def are_one(vectors: torch.Tensor) -> bool:
+    """Whether (N, 3) vectors are one by their values, for which the host may have to wait."""
+    vectors = vectors.detach()
+    return bool((vectors == vectors[:1]).all())
+
+
 def unit_vectors(vectors: torch.Tensor) -> torch.Tensor:
     """(..., 3) vectors of length 1, of such of any length but 0, whose squares need not be numbers."""
     exponent = vectors.detach().abs().amax(-1, keepdim=True).log2().floor()

@@ -15,7 +15,7 @@ import torch
 from difftetvr.errors import DiffTetError
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.rendering.cameras.pinhole import Camera
-from difftetvr.rendering.rays import Rays, one_vector
+from difftetvr.rendering.rays import Rays, are_one, one_vector
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Viewpoint:
             if (shared := one_vector(vectors)) is not None:
                 return Viewpoint(shared, is_direction, None)
             flat = vectors.reshape(-1, 3)
-            if bool((flat.detach() == flat[:1].detach()).all()):
+            if are_one(flat):
                 return Viewpoint(flat[0].detach(), is_direction, flat if flat.requires_grad else None)
         raise DiffTetError(
             "The field's colours depend on the direction (harmonics), and are known here for rays that start at one "

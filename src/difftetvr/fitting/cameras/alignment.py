@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 
 from difftetvr.capture.truth import Color, Truth
-from difftetvr.fitting.cameras.curvature import gauss_newton_steps
+from difftetvr.fitting.cameras.curvature import gauss_newton_steps, lengths_of
 from difftetvr.fitting.cameras.options import CameraRefinement
 from difftetvr.fitting.cameras.refined import RefinedCameras
 from difftetvr.fitting.processes import Processes
@@ -81,7 +81,7 @@ def _aligned(cameras: RefinedCameras, options: CameraRefinement, world: StillWor
             counts = truth.where_valid(view, torch.ones_like(seen.color), torch.zeros_like(seen.color))
             curvature = cameras.curvature_of(camera, seen, counts / counts.numel())
         else:
-            longest = _SHORTER * min(longest, float(torch.maximum(step[:3].norm(), step[3:].norm())))
+            longest = _SHORTER * min(longest, float(lengths_of(step[None])))
         step = gauss_newton_steps(gradient[None], curvature[None], longest)[0]
         if not bool(step.any()):  # the image does not depend on the pose: nothing is seen, say
             break

@@ -74,8 +74,12 @@ def gauss_newton_steps(gradient: torch.Tensor, curvature: torch.Tensor, longest:
     least = torch.finfo(curvature.dtype).tiny ** 0.5
     damped = curvature + (_DAMPING * mean + least)[:, None, None] * torch.eye(6, dtype=curvature.dtype)
     steps = -torch.linalg.solve(damped, gradient)
-    lengths = torch.maximum(steps[:, :3].norm(dim=1), steps[:, 3:].norm(dim=1))
-    return steps * (longest / lengths.clamp(min=longest))[:, None]
+    return steps * (longest / lengths_of(steps).clamp(min=longest))[:, None]
+
+
+def lengths_of(steps: torch.Tensor) -> torch.Tensor:
+    """(R,) lengths of (R, 6) steps: of the rotation or of the translation, whichever is longer."""
+    return torch.maximum(steps[:, :3].norm(dim=1), steps[:, 3:].norm(dim=1))
 
 
 def _slopes(color: torch.Tensor, axis: int) -> torch.Tensor:

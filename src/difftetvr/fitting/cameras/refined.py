@@ -125,8 +125,7 @@ class RefinedCameras:
             image: What its camera sees.
             weights: (H, W, C) of the squares of residuals in the loss.
         """
-        if self._moves:
-            self.curvature[view] += self.curvature_of(self.known(view), image, weights)
+        self.curvature[view] += self.curvature_of(self.known(view), image, weights)
 
     def curvature_of(self, camera: Camera, image: RenderedImage, weights: torch.Tensor) -> torch.Tensor:
         """(6, 6) second derivatives of a weighted sum of squares by a motion of the world of one of these cameras."""

@@ -61,6 +61,13 @@ class Around:
     cells: Any
     count: Any
 
+    @property
+    def held(self) -> Any:
+        """How many of them there was room for."""
+        uint, room = type(self.cells), dr.width(self.cells)
+        count = dr.gather(uint, self.count, uint(0))
+        return dr.select(count < room, count, room)
+
 
 @dataclass
 class Found:

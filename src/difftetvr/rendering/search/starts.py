@@ -95,9 +95,7 @@ def _rounding(face: Any) -> Any:
 
 def for_each_start_among(search: StartSearch, around: Around, visit: Visit) -> None:
     """Call ``visit`` for all of some cells in which rays start."""
-    uint = search.scene.backend.UInt
-    count, room = dr.gather(uint, around.count, uint(0)), dr.width(around.cells)
-    count = dr.select(count < room, count, room)
+    uint, count = search.scene.backend.UInt, around.held
 
     def body(index: Any) -> tuple[Any]:
         search.look_at(dr.gather(uint, around.cells, index), search.rays.valid, visit)

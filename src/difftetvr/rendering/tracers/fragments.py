@@ -116,9 +116,8 @@ class _CameraFragmentSearch:
 
     def _for_each_around(self, visit: Visit) -> None:
         """Crossings of cells that hold the camera: they begin behind it, where no face is rasterised."""
-        scene, uint, lane, room = self.scene, self.scene.backend.UInt, self.plan.lane, self.plan.capacity
-        rays, count = scene.rays.of_lanes(lane), dr.gather(uint, self.around.count, uint(0))
-        count = 4 * dr.select(count < room, count, room)
+        scene, uint, lane = self.scene, self.scene.backend.UInt, self.plan.lane
+        rays, count = scene.rays.of_lanes(lane), 4 * self.around.held
 
         def body(index: Any) -> tuple[Any]:
             half_face = 4 * dr.gather(uint, self.around.cells, index >> 2) + (index & 3)
