@@ -68,9 +68,9 @@ def test_progress_shows_what_there_is(small_capture, reference):
 def test_the_picture_is_of_the_view_that_was_learned_from_last(small_capture, monkeypatch):
     accumulate, learned, seen = ViewGradients._accumulate, [], []
 
-    def noting(self, mesh, view, iteration, weight):
+    def noting(self, mesh, view, *rest):
         learned.append(view)
-        return accumulate(self, mesh, view, iteration, weight)
+        return accumulate(self, mesh, view, *rest)
 
     monkeypatch.setattr(ViewGradients, "_accumulate", noting)
     config = dataclasses.replace(SMALL, iterations=11, batch_views=2)
