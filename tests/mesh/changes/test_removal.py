@@ -14,7 +14,7 @@ from difftetvr.mesh.changes.collapse import collapse_edges
 from difftetvr.mesh.changes.insertion import insert_delaunay
 from difftetvr.mesh.changes.removal import remove_cells
 from difftetvr.mesh.changes.star import star_subdivision
-from difftetvr.mesh.locate import locate, search
+from difftetvr.mesh.locate import TOLERANCE, locate, search
 
 
 @examples(15)
@@ -98,7 +98,8 @@ def test_insertion_is_the_delaunay_mesh_with_values_of_the_old_one(seed):
     values = mesh.vertices @ matrix
     carried = change.carry(values)
     assert torch.equal(carried[: mesh.num_vertices], values)
-    assert torch.allclose(carried, new.vertices @ matrix, rtol=1e-9, atol=1e-9 * float(values.abs().max()))
+    # A point that is outside a cell by less than the tolerance is held by it, and pulled onto its face.
+    assert torch.allclose(carried, new.vertices @ matrix, rtol=1e-9, atol=3 * TOLERANCE * float(values.abs().max()))
     assert torch.equal(change.corners.sort(1).values, mesh.tets[cells].sort(1).values)
     heaviest = change.corners.gather(1, change.corner_weights.argmax(1, keepdim=True))[:, 0]
     assert torch.equal(change.parents[mesh.num_vertices :, 0], heaviest)
