@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from difftetvr.mesh.arrays import chunks
+from difftetvr.mesh.arrays import chunks, true_indices
 from difftetvr.mesh.tetmesh import TetMesh
 
 TOLERANCE = 1e-6
@@ -53,7 +53,20 @@ def locate(mesh: TetMesh, points: torch.Tensor) -> tuple[torch.Tensor, torch.Ten
         moves = leaves.any(1)
         active, choice = active[moves], choice[moves]
         cells[active] = ahead[moves].gather(1, choice[:, None])[:, 0]
+    _cross_one_face_more(mesh, points, cells, weights, found)
     return cells, weights, found
+
+
+def _cross_one_face_more(
+    mesh: TetMesh, points: torch.Tensor, cells: torch.Tensor, weights: torch.Tensor, found: torch.Tensor
+) -> None:
+    """Give points that the tolerance alone left in their cells to the cell beyond the face, where they lie deeper."""
+    beside = true_indices(found & (weights.amin(1) < 0))
+    ahead = mesh.topology.cell_adjacency[cells[beside]].gather(1, weights[beside].argmin(1, keepdim=True))[:, 0].long()
+    beside, ahead = beside[ahead >= 0], ahead[ahead >= 0]
+    others = _barycentric(mesh.vertices.detach().double(), mesh.tets[ahead], points[beside])
+    is_deeper = others.amin(1) > weights[beside].amin(1)
+    cells[beside[is_deeper]], weights[beside[is_deeper]] = ahead[is_deeper], others[is_deeper]
 
 
 def search(mesh: TetMesh, point: torch.Tensor) -> tuple[int, torch.Tensor]:

