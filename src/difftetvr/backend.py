@@ -80,6 +80,10 @@ class Backend:
         """Whether the kernels run in float64."""
         return self.dtype == torch.float64
 
+    def at(self, dtype: torch.dtype | None) -> Backend:
+        """The same in another precision; None: in the best that it knows."""
+        return _at(self, dtype) if dtype != self.dtype else self
+
     def floats(self, tensor: torch.Tensor) -> Any:
         """Flat Dr.Jit view of a floating-point tensor, without a copy if it is contiguous and of this precision.
 
@@ -104,9 +108,9 @@ class Backend:
         """The numbers 0 to ``count`` - 1, in memory: of kernels that read them Dr.Jit knows the size."""
         return _lanes(self.UInt, count)
 
-    def constant(self, value: int) -> Any:
-        """An integer as a device value that is made once."""
-        return _constant(self.UInt, value)
+    def constant(self, value: float) -> Any:
+        """An integer, or a float of this precision, as a device value that is made once."""
+        return _constant(self.UInt if isinstance(value, int) else self.Float, value)
 
     def run(self, *arrays: Any) -> None:
         """Compute arrays, and wait for them unless PyTorch's work on the GPU waits by itself.
@@ -183,6 +187,12 @@ class Backend:
         return flat
 
 
+@cache
+def _at(backend: Backend, dtype: torch.dtype | None) -> Backend:
+    best = torch.float32 if backend.name == "metal" else torch.float64
+    return get_backend(str(backend.device), dtype or best)
+
+
 @lru_cache(maxsize=32)
 def _lanes(uint: Any, count: int) -> Any:
     numbers = dr.arange(uint, count)
@@ -191,8 +201,8 @@ def _lanes(uint: Any, count: int) -> Any:
 
 
 @lru_cache(maxsize=256)
-def _constant(uint: Any, value: int) -> Any:
-    return dr.opaque(uint, value)
+def _constant(kind: Any, value: float) -> Any:
+    return dr.opaque(kind, value)
 
 
 def eager(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:

@@ -95,7 +95,7 @@ def visits(mesh: TetMesh, rays: Rays) -> Tensor:
     density = torch.ones(mesh.num_vertices, dtype=mesh.vertices.dtype)
     medium = CellFeatures(mesh.vertices.new_zeros(mesh.num_cells, 0), Field(density[:, None], density))
     view = prepare_view(mesh, medium, rays, ViewOptions())
-    tracer = view.tracer(view.limits)
+    tracer = view.tracer(view.ends)
     count = dr.zeros(view.task.backend.UInt, len(rays.origins))
     tracer.trace(lambda lanes: _Visits(tracer, lanes, count))
     return view.task.backend.tensor(view.task.backend.Int(count))

@@ -7,7 +7,8 @@ from typing import Any
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypotheses import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from oracle.oracle import render_oracle
 from rendering.bundles import INSIDE, OUTSIDE, assert_same, flat, random_rays, scene
@@ -222,7 +223,7 @@ def test_no_ray_is_lost_in_float64_where_float32_was_first(renderer: str) -> Non
 
 
 @given(seed=st.integers(0, 2**31), cut=st.floats(0.0, 3.0))
-@settings(max_examples=20, deadline=None)
+@examples(20)
 def test_what_is_before_and_behind_a_distance_adds_up(seed: int, cut: float) -> None:
     mesh, field = scene()
     generator = torch.Generator().manual_seed(seed)

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypotheses import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from sampling.meshes import bent_mesh
 
@@ -42,7 +43,7 @@ def points_of(grid: Grid) -> torch.Tensor:
     lower=st.floats(-50.0, 50.0),
     spacing=st.one_of(st.floats(0.05, 20.0), st.tuples(*[st.floats(0.1, 20.0)] * 3)),
 )
-@settings(max_examples=50, deadline=None)
+@examples(50)
 def test_voxels_fill_the_box_of_a_mesh_and_little_more(
     box: tuple[float, float, float], lower: float, spacing: Any
 ) -> None:
@@ -53,7 +54,8 @@ def test_voxels_fill_the_box_of_a_mesh_and_little_more(
         step, count = grid.spacing[axis], grid.shape[axis]
         assert step == (spacing if isinstance(spacing, float) else spacing[axis])
         begin, end = grid.origin[axis] - 0.5 * step, grid.origin[axis] + (count - 0.5) * step
-        assert begin <= low[axis] + 1e-4 * step and end >= high[axis] - 1e-4 * step
+        # A side may be longer by a thousandth of a voxel than so many, so that rounding makes none that is empty.
+        assert begin <= low[axis] + 5.1e-4 * step and end >= high[axis] - 5.1e-4 * step
         assert end - begin < high[axis] - low[axis] + step
         assert begin + end == pytest.approx(low[axis] + high[axis], abs=1e-9)
 

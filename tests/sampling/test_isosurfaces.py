@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypotheses import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
@@ -24,7 +25,7 @@ def sides(triangles: Tensor) -> Counter[tuple[int, int]]:
 
 
 @given(seed=st.integers(0, 2**31), levels=st.sampled_from([2, 3, 5, 1000]))
-@settings(max_examples=30, deadline=None)
+@examples(30)
 def test_surfaces_are_closed_but_at_the_boundary_and_oriented(seed: int, levels: int) -> None:
     """Also where scalars are at the level, in whole regions."""
     generator = torch.Generator().manual_seed(seed)

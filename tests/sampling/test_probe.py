@@ -7,7 +7,8 @@ from typing import Any
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypotheses import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from sampling.meshes import bent_mesh
 from torch import Tensor
@@ -51,7 +52,7 @@ def test_values_are_those_of_brute_force() -> None:
     scale=st.sampled_from([1e-6, 1.0, 1e6]),
     dtype=st.sampled_from([torch.float32, torch.float64]),
 )
-@settings(max_examples=25, deadline=None)
+@examples(25)
 def test_linear_fields_are_exact_everywhere_in_a_mesh(seed: int, scale: float, dtype: torch.dtype) -> None:
     """On vertices, edges and faces, too."""
     generator = torch.Generator().manual_seed(seed)

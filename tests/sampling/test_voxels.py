@@ -7,7 +7,8 @@ from typing import Any
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypotheses import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from sampling.meshes import bent_mesh
 from torch import Tensor
@@ -24,7 +25,7 @@ from difftetvr.sampling.location import Lattice
     step=st.floats(0.01, 0.4),
     dtype=st.sampled_from([torch.float32, torch.float64]),
 )
-@settings(max_examples=25, deadline=None)
+@examples(25)
 def test_centres_have_the_values_of_probes(
     seed: int, shape: tuple[int, int, int], step: float, dtype: torch.dtype
 ) -> None:

@@ -232,7 +232,7 @@ def _render(
         return RenderedImage(empty[..., None].expand(*view.shape, view.task.channels), empty, empty, empty)
     with view.task.backend.exclusive():
         shot = view.shot()
-    tensors = view.vertices, view.pose, behind, view.limits, view.lines, *view.parts
+    tensors = view.vertices, view.pose, behind, view.followed, view.lines, *view.parts
     pixels = RenderFunction.apply(view.task, shot, *tensors)
     if view.task.backend.dtype != mesh.vertices.dtype:
         pixels = tuple(part.to(mesh.vertices.dtype) for part in pixels)

@@ -70,7 +70,7 @@ def inspect_rays(
         return RayStatistics(empty.int(), empty)
     backend, rays = view.task.backend, math.prod(view.shape)
     with backend.exclusive():
-        tracer = view.tracer(view.limits)
+        tracer = view.tracer(view.ends)
         count, worst = dr.zeros(backend.Int, rays), dr.zeros(backend.Float, rays)
         tracer.trace(lambda rays: _InspectionKernel(tracer, rays, count, worst))
         counts, least = backend.tensor(count, *view.shape), backend.tensor(worst, *view.shape)

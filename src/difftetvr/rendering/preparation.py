@@ -18,7 +18,7 @@ from difftetvr.rendering.cameras.pinhole import Camera
 from difftetvr.rendering.cell_features import CellFeatures
 from difftetvr.rendering.clip_plane import clip_limits
 from difftetvr.rendering.kernels.layout import LARGEST
-from difftetvr.rendering.prepared_rays import KNOW_FLOAT64, PreparedRays
+from difftetvr.rendering.prepared_rays import KNOW_FLOAT64, GivenBundle, PreparedRays
 from difftetvr.rendering.rays import Rays, RaySource, image_order
 from difftetvr.rendering.scalar_field import ScalarField
 from difftetvr.rendering.task import TRACERS, Content, RenderTask
@@ -55,7 +55,9 @@ class PreparedView:
         parts: What the volume holds, see :data:`difftetvr.rendering.task.Content`; densities are in that unit.
         unit: The unit, in world units.
         bundle: The rays, where they are not a camera's.
-        limits: (N, 2) distances in that unit between which rays are looked at; None for all in front of their origins.
+        ends: Flat (N, 2) distances in that unit between which rays are looked at, in kernels' memory; None for all in
+            front of their origins.
+        followed: The same as a tensor; None where autograd need not follow it.
         rays: The rays as kernels read them.
         upload: What was sent to kernels.
         laid_out: What they made of it.
@@ -69,20 +71,21 @@ class PreparedView:
     parts: tuple[torch.Tensor, ...]
     unit: float
     bundle: PreparedRays | None
-    limits: torch.Tensor | None
+    ends: Any | None
+    followed: torch.Tensor | None
     rays: KernelRays
     upload: Upload
     laid_out: LaidOut
     viewpoint: Viewpoint | None = None
 
-    def tracer(self, limits: torch.Tensor | None) -> Tracer:
-        """What crosses the mesh along the rays, between (N, 2) limits, which may lie behind those of the view."""
-        return self.task.tracer(self.upload, self.laid_out, limits, self.rays, self.parts)
+    def tracer(self, ends: Any | None) -> Tracer:
+        """What crosses the mesh along the rays between flat (N, 2) ends, which may be others than the view's."""
+        return self.task.tracer(self.upload, self.laid_out, ends, self.rays, self.parts)
 
     def shot(self) -> Shot:
         """The view, ready to be rendered."""
-        shift = None if self.bundle is None else self.task.backend.floats(self.bundle.shift)
-        return Shot(self.tracer(self.limits), self.rays.count, shift, self.unit)
+        shift = None if self.bundle is None else self.bundle.counted.shift
+        return Shot(self.tracer(self.ends), self.rays.count, shift, self.unit)
 
     def empty(self, shape: tuple[int, ...]) -> torch.Tensor:
         """What there is to see of no rays, in the precision of the mesh; autograd knows what it is no part of."""
@@ -92,8 +95,20 @@ class PreparedView:
 
     @property
     def lines(self) -> torch.Tensor | None:
-        """(N, 6) origins and unit directions of the rays, in that unit; None where they are a camera's."""
+        """(N, 6) origins and unit directions of the rays, in that unit; None where autograd need not follow them."""
         return None if self.bundle is None else self.bundle.lines
+
+    @property
+    def limits(self) -> torch.Tensor | None:
+        """(N, 2) distances in that unit between which rays are looked at; None for all in front of their origins."""
+        if self.followed is not None or self.ends is None:
+            return self.followed
+        return self.task.backend.tensor(self.ends, -1, 2)
+
+    @property
+    def shift(self) -> torch.Tensor | None:
+        """(N,) how far kernels' origins are from the rays' true ones, in world units; None where they are these."""
+        return None if self.bundle is None else self.task.backend.at(None).tensor(self.bundle.counted.shift)
 
 
 def prepare_view(
@@ -115,17 +130,16 @@ def prepare_view(
                 f"The field is on '{tensor.device}', the mesh on '{mesh.vertices.device}'; move one of them."
             )
     order: torch.Tensor | None = None
-    bundle: PreparedRays | None = None
     passed: _Passed
     if isinstance(source, Camera):
         shape: tuple[int, ...] = (source.height, source.width)
         clip = None if clip_plane is None else clip_limits(clip_plane, source, mesh.vertices, mesh.origin)
-        passed = _Passed(mesh.vertices, handed_over(source.world_to_camera, mesh.vertices), parts, 1.0, clip)
+        pose = handed_over(source.world_to_camera, mesh.vertices)
+        passed = _Passed(mesh.vertices, pose, parts, 1.0, None, clip)
     else:
         shape = tuple(source.shape)
         order = image_order(shape, mesh.vertices.device)
-        bundle = PreparedRays.of(source, mesh, clip_plane)
-        passed = _Passed(mesh.vertices, None, parts, 1.0, None)
+        passed = _Passed(mesh.vertices, None, parts, 1.0, GivenBundle.of(source, mesh, clip_plane), None)
     has_features = isinstance(field, CellFeatures) and content != "cell"
     task = RenderTask(
         backend_for(mesh.vertices),
@@ -142,41 +156,41 @@ def prepare_view(
     )
     if task.renderer == "marching":
         mesh.topology.cell_adjacency  # noqa: B018  refuses loose cells, which have none
-    view = _laid_out(task, shape, passed, bundle)
+    view = _laid_out(task, shape, passed)
     if not _is_common(view):
         task, passed = _uncommon(task, passed)
-        view = _laid_out(task, shape, passed, bundle)
+        view = _laid_out(task, shape, passed)
     return view if viewpoint is None else replace(view, viewpoint=viewpoint)
 
 
 @dataclass(frozen=True)
 class _Passed:
-    """What is passed to kernels, see :class:`PreparedView`; and (H, W, 2) ends of a camera's rays in world units."""
+    """What is passed to kernels, see :class:`PreparedView`; a bundle and (H, W, 2) ends of a camera's rays as given."""
 
     vertices: torch.Tensor
     pose: torch.Tensor | None
     parts: tuple[torch.Tensor, ...]
     unit: float
+    bundle: GivenBundle | None
     clip: torch.Tensor | None
 
 
-def _laid_out(task: RenderTask, shape: tuple[int, ...], passed: _Passed, bundle: PreparedRays | None) -> PreparedView:
-    backend = task.backend
+def _laid_out(task: RenderTask, shape: tuple[int, ...], passed: _Passed) -> PreparedView:
+    backend, bundle = task.backend, None
     parts = tuple(part.to(backend.dtype) for part in passed.parts)
-    if bundle is not None:
-        bundle = bundle.in_unit(passed.unit, backend.dtype)
-        limits = bundle.limits(passed.unit)
-    else:
-        limits = None if passed.clip is None else passed.clip.reshape(-1, 2).to(backend.dtype) / passed.unit
+    followed = None if passed.clip is None else passed.clip.reshape(-1, 2).to(backend.dtype) / passed.unit
+    ends = None if followed is None else backend.floats(followed)
     with backend.exclusive():
-        rays: Any = task.rays(None if bundle is None else bundle.lines)
+        if passed.bundle is not None:
+            bundle = PreparedRays.of(passed.bundle, task.mesh, backend, passed.unit)
+            followed, ends = bundle.limits, bundle.ends
+        rays: Any = task.rays(bundle)
         upload = task.upload(passed.vertices, passed.pose, parts)
-        laid_out = lay_out(upload, rays, task.plan(rays, bundle, limits))
+        laid_out = lay_out(upload, rays, task.plan(rays, bundle, ends))
     if laid_out.sees_all:
-        limits = None
-    return PreparedView(
-        task, shape, passed.vertices, passed.pose, parts, passed.unit, bundle, limits, rays, upload, laid_out
-    )
+        followed = ends = None
+    passed_on = passed.vertices, passed.pose, parts, passed.unit
+    return PreparedView(task, shape, *passed_on, bundle, ends, followed, rays, upload, laid_out)
 
 
 def _is_common(view: PreparedView) -> bool:
@@ -202,7 +216,8 @@ def _uncommon(task: RenderTask, passed: _Passed) -> tuple[RenderTask, _Passed]:
         Field(color, parts[1], task.content).validate(mesh)
     vertices, unit = _unit_of_length(positions, mesh)
     task = replace(task, backend=backend_for(vertices))
-    return task, _Passed(vertices, None, _parts_by_unit(task.content, parts, unit), unit, passed.clip)
+    parts = _parts_by_unit(task.content, parts, unit)
+    return task, replace(passed, vertices=vertices, pose=None, parts=parts, unit=unit)
 
 
 def _checked(mesh: Any, field: Any, camera: Any, options: ViewOptions) -> ViewOptions:

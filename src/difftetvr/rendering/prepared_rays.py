@@ -2,17 +2,51 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
+from torch.autograd.function import once_differentiable
 
+from difftetvr.backend import Backend
 from difftetvr.mesh import TetMesh
+from difftetvr.recording import replayed
 from difftetvr.rendering.clip_plane import clip_rays
-from difftetvr.rendering.rays import Rays, are_one, short_unit_vectors, unit_vectors
+from difftetvr.rendering.rays import Rays, one_vector, unit_vectors
+from difftetvr.rendering.search.memory_order import MemoryOrder
+from difftetvr.rendering.traversal.recount import CountedRays, GivenRays, Rows, recount
 
 KNOW_FLOAT64 = ("cpu", "cuda")
 """Devices that compute in float64."""
+
+
+@dataclass(frozen=True)
+class GivenBundle:
+    """A bundle of rays as callers pass it, relative to the mesh's origin and where the mesh is.
+
+    Attributes:
+        count: N.
+        origins, directions: (N, 3), the directions of any length but 0; or (1, 3) where all have the same.
+        near, far: (N, 1) distances between which rays are looked at, in world units; or (1, 1).
+    """
+
+    count: int
+    origins: torch.Tensor
+    directions: torch.Tensor
+    near: torch.Tensor
+    far: torch.Tensor
+
+    @staticmethod
+    def of(rays: Rays, mesh: TetMesh, clip_plane: Any) -> GivenBundle:
+        """Rays before a plane, if there is one, see :func:`difftetvr.render`."""
+        rays = rays.relative_to(mesh.origin)
+        origins, directions = (_rows(part, mesh.vertices) for part in (rays.origins, rays.directions))
+        near, far = (_rows(end[..., None], mesh.vertices) for end in rays.ends)
+        if clip_plane is not None:
+            wide = torch.float64 if mesh.vertices.device.type in KNOW_FLOAT64 else mesh.vertices.dtype
+            first, last = clip_rays(clip_plane, origins.to(wide), unit_vectors(directions.to(wide)), mesh.origin)
+            near, far = torch.maximum(near, first[:, None]), torch.minimum(far, last[:, None])
+        return GivenBundle(rays.shape.numel(), origins, directions, near, far)
 
 
 @dataclass(frozen=True)
@@ -20,60 +54,118 @@ class PreparedRays:
     """A bundle of rays, each counted from where it is nearest to the mesh's centre: there, float32 resolves most.
 
     Attributes:
-        lines: (N, 6) origins and unit directions, the origins in the unit of kernels.
-        shift: (N,) how far these origins are from the true ones, in world units.
-        near, far: (N,) distances from the true origins between which rays are looked at, in world units.
-        sees_all: Whether no ray starts or ends near the mesh; a tensor where the host would have to wait for it.
+        counted: The rays in kernels' memory.
+        ends: Their limits there; None where nothing is known to be cut off.
+        sees_all: (2,) flags there, the first of them 1 if no ray begins or ends near the mesh; None if nobody asks.
         begins_at_point: Whether all rays are known to be looked at from one point on.
+        near: (N,) or (1,) distances from the true origins from which on rays are looked at, in world units.
+        lines, limits: (N, 6) and (N, 2), those of ``counted`` as autograd follows them; None where it need not.
     """
 
-    lines: torch.Tensor
-    shift: torch.Tensor
-    near: torch.Tensor
-    far: torch.Tensor
-    sees_all: bool | torch.Tensor
+    counted: CountedRays
+    ends: Any | None
+    sees_all: Any | None
     begins_at_point: bool
+    near: torch.Tensor
+    lines: torch.Tensor | None
+    limits: torch.Tensor | None
 
     @staticmethod
-    def of(rays: Rays, mesh: TetMesh, clip_plane: Any) -> PreparedRays:
-        """Count rays, before a plane if there is one, anew from near a mesh; differentiable in them."""
-        device = mesh.vertices.device
-        dtype = torch.float64 if device.type in KNOW_FLOAT64 else mesh.vertices.dtype
-        rays = rays.relative_to(mesh.origin)
-        directions = rays.directions.reshape(-1, 3).to(device, dtype)
-        # One origin of all is one on the device, too.
-        eye = rays.eye
-        origins = (rays.origins.reshape(-1, 3) if eye is None else eye).to(device, dtype).expand_as(directions)
-        near, far = (end.reshape(-1).to(device, dtype) for end in rays.ends)
-        is_narrow = rays.directions.dtype != torch.float64 and dtype == torch.float64
-        directions = short_unit_vectors(directions) if is_narrow else unit_vectors(directions)
-        vertices = mesh.vertices.detach()
-        low, high = vertices.amin(0).to(dtype), vertices.amax(0).to(dtype)
-        center, radius = torch.lerp(low, high, 0.5), 0.5 * torch.linalg.vector_norm(high - low)
-        shift = ((center - origins.detach()) * directions.detach()).sum(1)
-        lines = torch.cat((torch.addcmul(origins, shift[:, None], directions), directions), dim=1)
-        if clip_plane is not None:
-            first, last = clip_rays(clip_plane, origins, directions, mesh.origin)
-            near, far = torch.maximum(near, first), torch.minimum(far, last)
-        sees_all: bool | torch.Tensor = False
-        if clip_plane is None and not (near.requires_grad or far.requires_grad):
-            # How far from the centre rays begin and end, at least: they see all where that is beyond the mesh.
-            away = torch.minimum(shift - near, far - (1.0 + 1e-5) * shift.abs())
-            sees_all = away.amin() >= 1.001 * radius if len(away) else away.new_ones((), dtype=torch.bool)
-            sees_all = bool(sees_all) if device.type == "cpu" else sees_all
-        may_begin_inside = device.type == "cpu" and not sees_all
-        begins_at_point = may_begin_inside and are_one(origins.detach() + (near[:, None] * directions).detach())
-        return PreparedRays(lines, shift, near, far, sees_all, begins_at_point)
+    def of(given: GivenBundle, mesh: TetMesh, backend: Backend, unit: float) -> PreparedRays:
+        """Count rays anew from near a mesh; differentiable in them.
 
-    def limits(self, unit: float) -> torch.Tensor | None:
-        """(N, 2) distances from these origins in the unit of kernels; None where nothing is known to be cut off."""
-        if self.sees_all is True:
-            return None
-        return torch.stack((self.near - self.shift, self.far - self.shift), dim=1) / unit
+        Args:
+            given: The rays.
+            mesh: The mesh.
+            backend: Where kernels run, and at which precision.
+            unit: The unit of kernels, in world units.
+        """
+        rows = given.origins, given.directions, given.near, given.far
+        counted = _counted(given, mesh, backend, unit)
+        is_told = backend.name == "llvm" or not given.count
+        sees_all, begins_at_point = (flag > 0 for flag in counted.flags.numpy().tolist()) if is_told else (False, False)
+        lines = limits = None
+        if any(part.requires_grad for part in rows):
+            lines, limits = _Recount.apply(counted, backend, unit, *rows)
+        ends_matter = given.near.requires_grad or given.far.requires_grad
+        return PreparedRays(
+            counted,
+            None if sees_all and not ends_matter else counted.limits,
+            None if is_told or ends_matter else counted.flags,
+            begins_at_point,
+            given.near[:, 0],
+            lines,
+            limits if ends_matter else None,
+        )
 
-    def in_unit(self, unit: float, dtype: torch.dtype) -> PreparedRays:
-        """The same with origins in a unit of kernels, in world units, and at their precision."""
-        lines = self.lines
-        if unit != 1.0:
-            lines = lines * lines.new_tensor([1.0 / unit] * 3 + [1.0] * 3)
-        return replace(self, lines=lines.to(dtype))
+
+def _counted(given: GivenBundle, mesh: TetMesh, backend: Backend, unit: float) -> CountedRays:
+    """The rays as kernels count them."""
+    wide = backend.at(None)
+    if not given.count:
+        none = backend.Float()
+        return CountedRays(none, none, wide.Float(), wide.Float(), backend.Float(1, 1))
+
+    def rows(part: torch.Tensor) -> Rows:
+        return Rows(backend.at(part.dtype).floats(part), int(len(part) > 1), part.shape[1])
+
+    arrays = GivenRays(
+        backend,
+        wide.Float,
+        backend.lanes(given.count),
+        given.count,
+        rows(given.origins),
+        rows(given.directions),
+        rows(given.near),
+        rows(given.far),
+        backend.at(mesh.vertices.dtype).floats(mesh.vertices),
+        MemoryOrder.of(mesh).tables(backend).vertices,
+        wide.constant(unit),
+    )
+    counted: CountedRays = replayed(recount, arrays)
+    return counted
+
+
+def _rows(values: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
+    """(N, width) of (..., width), or (1, width) where these are one in memory; where another tensor is."""
+    one = one_vector(values)
+    rows = values.reshape(-1, values.shape[-1]) if one is None else one[None]
+    is_known = rows.dtype == torch.float32 or (rows.dtype == torch.float64 and like.device.type in KNOW_FLOAT64)
+    return rows.to(like.device, rows.dtype if is_known else torch.float32)
+
+
+class _Recount(torch.autograd.Function):
+    """From (N, 3) origins and directions and (N, 1) ends of rays, or one row for all, to their lines and limits.
+
+    Where on its line a ray is counted from is of no consequence, so its shift counts as constant.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, counted: CountedRays, backend: Backend, unit: float, *rows: torch.Tensor) -> Any:
+        """Hand over what kernels have counted."""
+        ctx.set_materialize_grads(False)
+        lines, limits = backend.tensor(counted.lines, -1, 6), backend.tensor(counted.limits, -1, 2)
+        shift, length = (backend.at(None).tensor(part) for part in (counted.shift, counted.length))
+        ctx.unit, ctx.rows = unit, [(part.shape, part.dtype) for part in rows]
+        ctx.save_for_backward(lines, shift, length)
+        return lines, limits
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, by_lines: torch.Tensor | None, by_limits: torch.Tensor | None) -> Any:
+        """The transposes of what was done to each ray."""
+        lines, shift, length = ctx.saved_tensors
+        found: list[torch.Tensor | None] = [None] * 4
+        if by_lines is not None:
+            by_origin, by_direction = by_lines.to(shift.dtype).split(3, dim=1)
+            by_origin, direction = by_origin / ctx.unit, lines[:, 3:]
+            by_direction = by_direction + shift[:, None] * by_origin
+            along = direction * (direction * by_direction).sum(1, keepdim=True)
+            found[:2] = by_origin, (by_direction - along) / length[:, None]
+        if by_limits is not None:
+            found[2:] = (by_limits.to(shift.dtype) / ctx.unit).split(1, dim=1)
+        by_rows = (
+            None if part is None else part.sum_to_size(shape).to(dtype)
+            for part, (shape, dtype) in zip(found, ctx.rows, strict=True)
+        )
+        return None, None, None, *by_rows

@@ -101,41 +101,36 @@ class RenderTask:
         )
         return Upload(self.mesh, order, tables, source, cells)
 
-    def rays(self, lines: torch.Tensor | None) -> KernelRays:
-        """The rays: a bundle of (N, 6) origins and unit directions, or those of the camera."""
-        if lines is not None:
-            return BundleRays.of(self.backend, lines, self.order)
+    def rays(self, bundle: PreparedRays | None) -> KernelRays:
+        """The rays: those of a bundle, or of the camera."""
+        if bundle is not None:
+            return BundleRays.of(self.backend, bundle.counted.lines, self.order)
         assert self.camera is not None
         return self.camera.kernel_rays(self.backend)
 
-    def plan(self, rays: KernelRays, bundle: PreparedRays | None, limits: torch.Tensor | None) -> SearchPlan | None:
+    def plan(self, rays: KernelRays, bundle: PreparedRays | None, ends: Any | None) -> SearchPlan | None:
         """What the tracer has to know of the rays first.
 
         Args:
             rays: The rays.
             bundle: The same, where they are not a camera's.
-            limits: (N, 2) distances between which each ray is looked at; None for all of it.
+            ends: Flat (N, 2) distances between which each ray is looked at; None for all of it.
         """
         backend, stretches = self.backend, None
         if not rays.count:
             return None
         if bundle is not None:
-            ends = None if limits is None else backend.floats(limits)
-            flag = bundle.sees_all
-            sees_all = None if isinstance(flag, bool) else backend.floats(flag.to(backend.dtype)[None])
-            stretches = Stretches(backend.lanes(rays.lane_count), ends, sees_all, bundle.begins_at_point)
+            stretches = Stretches(backend.lanes(rays.lane_count), ends, bundle.sees_all, bundle.begins_at_point)
         plan: SearchPlan | None = TRACERS[self.renderer].plan(backend, self.mesh, rays, stretches)
         return plan
 
-    def tracer(
-        self, upload: Upload, laid_out: LaidOut, limits: torch.Tensor | None, rays: KernelRays, parts: Any
-    ) -> Tracer:
+    def tracer(self, upload: Upload, laid_out: LaidOut, ends: Any | None, rays: KernelRays, parts: Any) -> Tracer:
         """What crosses a mesh that is laid out.
 
         Args:
             upload: The mesh.
             laid_out: The same, in memory.
-            limits: (N, 2) distances between which each ray is looked at; None for all in front of its origin.
+            ends: Flat (N, 2) distances between which each ray is looked at; None for all in front of its origin.
             rays: The rays.
             parts: What the volume holds, see :data:`Content`.
         """
@@ -150,7 +145,7 @@ class RenderTask:
             self.content == "cell",
             Transfer.of(backend, parts[-2], parts[-1]) if self.content == "scalar" else None,
             backend.opaque(self.threshold),
-            None if limits is None else backend.floats(limits),
+            ends,
             backend.lanes(rays.lane_count),
         )
         aim = Aim(view, upload.scene(laid_out.records, rays), self.mesh, laid_out.found)

@@ -160,7 +160,8 @@ def _summary(backend: Backend, extent: Any, found: Found, sees_all: Any | None) 
     around = none if found.around is None else found.around.count
     whole = (found.counts.most, found.counts.total, around)
     halves = [half for number in whole for half in (number >> 16, number & 0xFFFF)]
-    numbers = [*(backend.Float(half) for half in halves), backend.Float(0) if sees_all is None else sees_all]
+    sees = backend.Float(0) if sees_all is None else dr.gather(backend.Float, sees_all, backend.UInt(0))
+    numbers = [*(backend.Float(half) for half in halves), sees]
     numbers += [backend.Float(0)] * (_NUMBERS - len(numbers))
     dr.scatter(summary, backend.Floats(numbers), backend.UInt(EXTENT // _NUMBERS))
     dr.eval(summary)

@@ -72,7 +72,7 @@ def model_image(
     _require_shapes(view, mesh, truth, valid, face_steps)
     behind = as_background(background, mesh.vertices)
     backend = view.task.backend
-    tracer = view.tracer(view.limits)
+    tracer = view.tracer(view.ends)
     with backend.exclusive(deterministic):
         how = Composition(None if behind is None else backend.floats(behind), None, view.unit)
         rendered = render_forward(tracer, how)

@@ -57,7 +57,7 @@ def model_line_integrals(
     if 0 in view.shape:
         raise DiffTetError(f"The view has the shape {view.shape}, so it says nothing; pass one of a ray at least.")
     backend = view.task.backend
-    tracer = view.tracer(view.limits)
+    tracer = view.tracer(view.ends)
     with backend.exclusive(deterministic):
         slopes, curvatures, steps = (
             backend.floats(part.reshape(-1)) for part in (*errors, face_steps.to(mesh.vertices) * view.unit)

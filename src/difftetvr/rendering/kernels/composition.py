@@ -72,7 +72,7 @@ class Pixels:
             channels = [dr.fma(transmittance, b, c) for b, c in zip(behind, channels, strict=True)]
         if channels:
             dr.scatter(self.color, backend.Floats(channels), pixel, valid)
-        shift = real(0) if how.shift is None else dr.gather(real, how.shift, pixel, valid)
+        shift = real(0) if how.shift is None else real(dr.gather(type(how.shift), how.shift, pixel, valid))
         dr.scatter(self.alpha, alpha, pixel, valid)
         dr.scatter(self.depth, expected_distance(distance, alpha, shift, how.unit), pixel, valid)
         dr.scatter(self.optical_depth, optical_depth, pixel, valid)

@@ -13,6 +13,7 @@ import drjit as dr
 from difftetvr.backend import Backend
 from difftetvr.rendering.search.starts import EXTENT
 from difftetvr.rendering.traversal.records import PACKET, Records, packets_of
+from difftetvr.rendering.traversal.sums import raise_to
 
 LARGEST = 1e6
 """Greatest coordinate that is laid out; anything beyond would overflow in products of float32."""
@@ -90,7 +91,7 @@ def lay_out_vertices(source: VertexSource, length: int) -> tuple[Any, Any]:
         is_bad |= value < 0
     ends = [end for coordinate in position for end in (coordinate, -coordinate)]
     for k, end in enumerate([*ends, dr.select(is_bad, real(1), real(0))]):
-        _reach(source.backend, extent, end, k)
+        raise_to(source.backend, extent, end, k)
     # Searches go through what is too large for them, too, before the host hears of it.
     values[:3] = [dr.select(dr.abs(coordinate) <= LARGEST, coordinate, 0) for coordinate in position]
     values += [real(0)] * (PACKET * stride - len(values))
@@ -107,7 +108,7 @@ def lay_out_cells(source: CellSource, length: int) -> tuple[Any, Any]:
     channels = [dr.gather(backend.Float, source.channels, count * cell + k) for k in range(count)]
     extent = dr.full(backend.Float, -dr.inf, EXTENT)
     is_bad = _any_unbounded([density, *channels]) | (density < 0)
-    _reach(backend, extent, dr.select(is_bad, backend.Float(1), backend.Float(0)), EXTENT - 2)
+    raise_to(backend, extent, dr.select(is_bad, backend.Float(1), backend.Float(0)), EXTENT - 2)
     layout = Records(count)
     records, place = dr.empty(backend.Float, layout.width * length), dr.arange(backend.UInt, dr.width(cell))
     layout.scatter(backend, records, [*channels, density], place)
@@ -195,8 +196,3 @@ def _any_unbounded(values: list[Any]) -> Any:
     for value in values[1:]:
         is_bad |= ~dr.isfinite(value)
     return is_bad
-
-
-def _reach(backend: Backend, extent: Any, value: Any, place: int) -> None:
-    mode = dr.ReduceMode.Expand if backend.name == "llvm" else dr.ReduceMode.Auto
-    dr.scatter_reduce(dr.ReduceOp.Max, extent, value, backend.UInt(place), mode=mode)

@@ -67,7 +67,7 @@ def depth_at(
     def distances(view: PreparedView) -> torch.Tensor:
         depths = -torch.log(_of_each_ray(values, view, "transmittance"))
         found = distances_at(view, view.limits, depths) * view.unit
-        return found if view.bundle is None else found + view.bundle.shift[:, None]
+        return found if view.shift is None else found + view.shift[:, None]
 
     options = ViewOptions(deterministic=deterministic, renderer=renderer)
     return _of_views(lambda one: _looked(mesh, field, one, options, clip_plane, values, distances), camera, renderer)
@@ -113,8 +113,9 @@ def transmittance_at(
 
     def transmittances(view: PreparedView) -> torch.Tensor:
         along, near = _of_each_ray(places, view, "distances"), torch.zeros((), dtype=torch.float64)
-        if view.bundle is not None:
-            along, near = along - view.bundle.shift[:, None], (view.bundle.near - view.bundle.shift)[:, None]
+        shift = view.shift
+        if view.bundle is not None and shift is not None:
+            along, near = along - shift[:, None], (view.bundle.near - shift)[:, None]
         along, near, limits = along / view.unit, near.to(along) / view.unit, view.limits
         if limits is not None:
             # Distances do not pass the far end, so that it need not cut cells, and where it is has its derivatives.

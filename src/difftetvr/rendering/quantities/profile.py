@@ -51,7 +51,7 @@ def _profile(
 ) -> torch.Tensor:
     ascending, order = questions.to(view.task.backend.dtype).sort(dim=1)
     with view.task.backend.exclusive():
-        tracer = view.tracer(limits)
+        tracer = view.tracer(None if limits is None else view.task.backend.floats(limits))
     answers: torch.Tensor = _ProfileFunction.apply(
         view.task, tracer, is_inverse, view.vertices, view.pose, limits, view.lines, ascending, *view.parts
     )

@@ -36,7 +36,7 @@ class Stretches:
     Attributes:
         lane: Numbers of all lanes.
         limits: Flat (N, 2) distances between which each ray is looked at; None for all of it.
-        sees_all: (1,) whether they turn out not to matter, see :class:`difftetvr.rendering.search.plan.SearchPlan`.
+        sees_all: Whether they turn out not to matter, see :class:`difftetvr.rendering.search.plan.SearchPlan`.
         begins_at_point: Whether all rays are known to begin at one point.
     """
 

@@ -278,10 +278,13 @@ def _box(backend: Backend, boxes: Any, node: Any) -> tuple[list[Any], list[Any]]
     return [first[0], first[1], first[2]], [-first[3], -second[0], -second[1]]
 
 
-def _store(backend: Backend, boxes: Any, node: Any, ends: list[Any]) -> None:
-    """Write least and negated greatest coordinates of a node."""
-    dr.scatter(boxes, backend.Float4(*ends[:4]), 2 * node)
-    dr.scatter(boxes, backend.Float4(*ends[4:], 0, 0), 2 * node + 1)
+def _store(backend: Backend, boxes: Any, row: Any, *nodes: list[Any]) -> None:
+    """Write least and negated greatest coordinates of nodes that follow each other; rows have so many.
+
+    All at once, for each time that an array is written to takes a kernel of its own.
+    """
+    zero = backend.Float(0)
+    dr.scatter(boxes, backend.Floats([value for ends in nodes for value in (*ends, zero, zero)]), row)
 
 
 def _leaf_boxes(leaves: Leaves, cells: Cells) -> list[Any]:
@@ -313,9 +316,8 @@ def _raised(backend: Backend, boxes: Any, below: Any, node: Any, levels: tuple[i
     while level > last:
         level -= 1
         ends = [[dr.fmin(a, b) for a, b in zip(*pair, strict=True)] for pair in zip(ends[::2], ends[1::2], strict=True)]
-        first = (1 << level) + (node << (level - last))
-        for k, box in enumerate(ends):
-            _store(backend, boxes, first + k, box)
+        # Nodes 2^level + 2^(level - last) node and on.
+        _store(backend, boxes, (1 << last) + node, *ends)
     top = dr.empty(backend.Float, 8 << last)
     _store(backend, top, node, ends[0])
     dr.eval(boxes, top)

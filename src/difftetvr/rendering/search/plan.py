@@ -111,7 +111,7 @@ class SearchPlan(Protocol):
 
     @property
     def sees_all(self) -> Any | None:
-        """(1,) 1 if no ray begins or ends near the mesh, else 0; None where that need not be told."""
+        """Flags, of which the first is 1 if no ray begins or ends near the mesh, else 0; None if nobody asks."""
         ...
 
     def find(self, scene: Scene, extent: Any) -> Found:

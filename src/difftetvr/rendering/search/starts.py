@@ -18,6 +18,7 @@ from difftetvr.rendering.search.hits import Hit, Visit
 from difftetvr.rendering.search.plan import Around
 from difftetvr.rendering.search.scene import Scene
 from difftetvr.rendering.traversal.rays import Lanes, rounding_of
+from difftetvr.rendering.traversal.sums import raise_to
 from difftetvr.rendering.traversal.walk import BOUNDARY, crossing_depth, find_exit
 
 AROUND = 1 << 10
@@ -116,14 +117,12 @@ def reach_of_beginnings(scene: Scene, lane: Any, limits: Any) -> Any:
     assert rays.frame.origin is not None
     near = dr.gather(backend.Float2, limits, rays.pixel, rays.valid)[0]
     reach = dr.full(backend.Float, -dr.inf, EXTENT)
-    mode = dr.ReduceMode.Expand if backend.name == "llvm" else dr.ReduceMode.Auto
     for axis, (d, o) in enumerate(zip(rays.frame.direction, rays.frame.origin, strict=True)):
         begin = dr.fma(near, d, o)
         # Where a ray begins nowhere, there is no one point.
         begin = dr.select(dr.isfinite(begin), begin, dr.inf)
         for side, end in enumerate((begin, -begin)):
-            place = backend.UInt(2 * axis + side)
-            dr.scatter_reduce(dr.ReduceOp.Max, reach, dr.select(rays.valid, end, -dr.inf), place, mode=mode)
+            raise_to(backend, reach, dr.select(rays.valid, end, -dr.inf), 2 * axis + side)
     dr.eval(reach)
     return reach
 

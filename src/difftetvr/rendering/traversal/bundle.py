@@ -31,11 +31,11 @@ class BundleRays:
     count: int
 
     @staticmethod
-    def of(backend: Backend, lines: torch.Tensor, order: torch.Tensor | None) -> BundleRays:
-        """Take (N, 6) origins and directions, which must not change, and (N,) int32 numbers of the lanes' rays."""
-        count = lines.shape[0]
+    def of(backend: Backend, lines: Any, order: torch.Tensor | None) -> BundleRays:
+        """Take flat (N, 6) origins and unit directions, and (N,) int32 numbers of the lanes' rays."""
+        count = dr.width(lines) // 6
         lanes = None if order is None else backend.uints(order)
-        return BundleRays(backend, backend.floats(lines), lanes, backend.opaque_uint(count), count)
+        return BundleRays(backend, lines, lanes, backend.opaque_uint(count), count)
 
     @property
     def lane_count(self) -> int:

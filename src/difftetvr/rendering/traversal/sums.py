@@ -76,3 +76,9 @@ class Sums:
             place = place + self.copies.floats
             total += dr.gather(real, self.buffer, place)
         return total
+
+
+def raise_to(backend: Backend, numbers: Any, value: Any, place: int) -> None:
+    """Raise one of some numbers to the greatest value that any lane has."""
+    mode = dr.ReduceMode.Expand if backend.name == "llvm" else dr.ReduceMode.Auto
+    dr.scatter_reduce(dr.ReduceOp.Max, numbers, value, backend.UInt(place), mode=mode)
