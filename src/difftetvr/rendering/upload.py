@@ -161,8 +161,8 @@ def _summary(backend: Backend, extent: Any, found: Found, sees_all: Any | None) 
     whole = (found.counts.most, found.counts.total, around)
     halves = [half for number in whole for half in (number >> 16, number & 0xFFFF)]
     sees = backend.Float(0) if sees_all is None else dr.gather(backend.Float, sees_all, backend.UInt(0))
-    numbers = [*(backend.Float(half) for half in halves), sees]
-    numbers += [backend.Float(0)] * (_NUMBERS - len(numbers))
+    flags = none if found.flags is None else found.flags
+    numbers = [*(backend.Float(part) for part in (*halves, flags)), sees]
     dr.scatter(summary, backend.Floats(numbers), backend.UInt(EXTENT // _NUMBERS))
     dr.eval(summary)
     return summary
@@ -173,4 +173,5 @@ def _read(summary: Any) -> tuple[Extent, Told]:
     numbers = summary.numpy().tolist()
     halves = [int(number) for number in numbers[EXTENT : EXTENT + 6]]
     most, total, around = (high << 16 | low for high, low in zip(halves[::2], halves[1::2], strict=True))
-    return Extent.of(numbers), Told(most, total, around, numbers[EXTENT + 6] > 0)
+    flags, sees_all = numbers[EXTENT + 6 :]
+    return Extent.of(numbers), Told(most, total, around, sees_all > 0, int(flags))

@@ -35,7 +35,7 @@ def is_convex(vertices: torch.Tensor, topology: Topology) -> bool:
     Returns:
         False for holes, hollows, several components, or components that meet at an edge or a vertex only.
     """
-    creases = topology.cached("delaunay_check.creases", lambda: _boundary_creases(topology))
+    creases = boundary_creases(topology)
     if creases is None:
         return False
     positions, noise = _centered(vertices, topology)
@@ -117,11 +117,15 @@ def _cross(p: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
     return torch.stack((py * qz - pz * qy, pz * qx - px * qz, px * qy - py * qx))
 
 
-def _boundary_creases(topology: Topology) -> torch.Tensor | None:
+def boundary_creases(topology: Topology) -> torch.Tensor | None:
     """(E, 4) int64 a, b, c, d for each edge (a, b) of the boundary between the faces a, b, c and b, a, d.
 
     None if the boundary is no single surface with two faces at every edge.
     """
+    return topology.cached("delaunay_check.creases", lambda: _boundary_creases(topology))
+
+
+def _boundary_creases(topology: Topology) -> torch.Tensor | None:
     faces = topology.boundary_faces.long()
     ends = torch.cat((faces, faces[:, [1, 2, 0]], faces[:, [2, 0, 1]]))
     keys = (ends[:, :2].amin(1) << _PLACE_BITS) | ends[:, :2].amax(1)

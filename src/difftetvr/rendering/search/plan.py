@@ -77,11 +77,15 @@ class Found:
         counts: How much it is.
         around: The cells around where rays begin; None where there is no one point.
         boxes: Of the hierarchies that were built.
+        sorting: By what cells are sorted, and where they are seen; None where they are not.
+        flags: (1,) bits, few, to which the plan gives a meaning; None for none.
     """
 
     counts: Counts
     around: Around | None
     boxes: list[Any]
+    sorting: tuple[Any, Any] | None = None
+    flags: Any | None = None
 
 
 @dataclass(frozen=True)
@@ -93,12 +97,14 @@ class Told:
         total: The sum of all numbers.
         around: How many cells there are around where rays begin.
         sees_all: Whether no ray begins or ends near the mesh, so that limits do not matter.
+        flags: See :class:`Found`.
     """
 
     most: int
     total: int
     around: int
     sees_all: bool
+    flags: int
 
 
 class SearchPlan(Protocol):

@@ -14,27 +14,120 @@ need not be Delaunay.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 
+from difftetvr.backend import Backend
 from difftetvr.mesh.arrays import chunks, put, sort_keys, true_indices
-from difftetvr.mesh.making.delaunay_check import CellShape, dot, is_convex
+from difftetvr.mesh.making.delaunay_check import boundary_creases
 from difftetvr.mesh.tetmesh import TetMesh
+from difftetvr.mesh.topology.topology import Topology
+from difftetvr.rendering.search.memory_order import MemoryOrder
+from difftetvr.rendering.search.plan import Counts, Found, Told
+from difftetvr.rendering.search.scene import Scene
+from difftetvr.rendering.tracers.cell_keys import (
+    BEHIND,
+    DENTED,
+    UNSETTLED,
+    CellKeys,
+    CellsToSort,
+    Creases,
+    dented,
+    keys_of,
+    told_flags,
+)
+from difftetvr.rendering.tracers.tiles import CellTiles, tiles_of
 
 _MAX_ROUNDS = 200
-"""Rounds of moving cells back one after another before all of them take turns: 20 are usual."""
+"""Rounds of moving cells back one after another before all of them take turns."""
 
 _MAX_MOVES = 2
 """Moves per cell, on the average, before all of them take turns."""
 
-_SURE = 0.05
-"""How far, in units of its longest edge, rounding may move the centre of a cell's circumsphere for it to count."""
-
-_SIGN_CERTAIN = 16.0 * 2.0**-52
-"""Rounding of a face's distance from the eye, times the face's area, in units of edge length times distance squared."""
-
 _FIRST = -(2**63)
-_EXPONENT_AND_FRACTION = 2**63 - 1
+
+
+@dataclass
+class OrderPlan:
+    """Plans to sort the cells of a view; see :class:`difftetvr.rendering.search.plan.SearchPlan`.
+
+    In a convex mesh the order is exact unless cells overlap cyclically as seen from the eye, which in Delaunay meshes
+    they never do. In other meshes it is right along every stretch of a ray that does not leave the mesh, and across
+    gaps if the cells are part of a Delaunay mesh. Loose cells are sorted by the distance of their centroids.
+
+    Attributes:
+        cells: The cells.
+        creases: Of the boundary; None where it is known not to be that of a convex body.
+        capacity, sees_all: Nothing is looked for along rays.
+    """
+
+    cells: CellsToSort
+    creases: Creases | None
+    capacity: int = 0
+    sees_all: Any | None = None
+
+    @staticmethod
+    def of(backend: Backend, mesh: TetMesh) -> OrderPlan:
+        """Plan for a mesh."""
+        tables, creases = MemoryOrder.of(mesh).tables(backend), None
+        if mesh.is_conforming and boundary_creases(mesh.topology) is not None:
+            edges, numbers = mesh.topology.cached(
+                f"render.creases.{backend.name}", lambda: _uploaded_creases(backend, mesh.topology)
+            )
+            exact, single = (torch.finfo(dtype).eps for dtype in (mesh.vertices.dtype, torch.float32))
+            positions = backend.at(mesh.vertices.dtype).floats(mesh.vertices)
+            creases = Creases(backend, edges, numbers, positions, exact, single)
+        return OrderPlan(CellsToSort(tables.numbers, tables.adjacency, torch.finfo(backend.dtype).eps), creases)
+
+    def find(self, scene: Scene, extent: Any) -> Found:
+        """See :meth:`difftetvr.rendering.search.plan.SearchPlan.find`."""
+        found = keys_of(scene, self.cells, extent)
+        tiles = tiles_of(scene, self.cells.cell)
+        dents = None if self.creases is None else dented(self.creases)
+        flags = told_flags(scene.backend, found.unsettled, dents, extent)
+        return Found(Counts.of(scene.backend.UInt(tiles.pairs), None), None, [], (found, tiles), flags)
+
+    def settled(self, scene: Scene, found: Found, told: Told) -> KeyedCells:
+        """See :meth:`difftetvr.rendering.search.plan.SearchPlan.settled`."""
+        assert found.sorting is not None
+        keys, tiles = found.sorting
+        return KeyedCells(keys, tiles, told, self.creases is not None)
+
+
+@dataclass(frozen=True)
+class KeyedCells:
+    """The cells of a view, still to be sorted.
+
+    Attributes:
+        keys: What they are sorted by.
+        tiles: Where in the image they may be seen.
+        told: What the host has heard of both.
+        is_closed: Whether their boundary is one closed surface.
+    """
+
+    keys: CellKeys
+    tiles: CellTiles
+    told: Told
+    is_closed: bool
+
+    @property
+    def starts_inside(self) -> bool:
+        """Whether some crossings may begin behind the camera."""
+        return bool(self.told.flags & BEHIND)
+
+    def sorted(self, backend: Backend, topology: Topology) -> CellOrder:
+        """Sort them, after more moves of cells if those in kernels were not enough."""
+        keys, is_right = backend.tensor(self.keys.keys), topology.is_conforming
+        if self.told.flags & UNSETTLED:
+            columns = [backend.tensor(backend.Int(part)) for part in self.keys.predecessors]
+            predecessors = torch.stack(columns, dim=1)
+            predecessors[predecessors < 0] = len(keys)
+            keys = torch.cat((keys, keys.new_full((1,), _FIRST)))
+            is_right = _move_behind_predecessors(keys, predecessors, topology.cell_adjacency)
+            keys = keys[:-1]
+        exact = is_right and self.is_closed and not self.told.flags & DENTED
+        return CellOrder(torch.argsort(keys), exact)
 
 
 @dataclass(frozen=True)
@@ -42,7 +135,7 @@ class CellOrder:
     """All cells of a mesh, front to back.
 
     Attributes:
-        order: (T,) int64 cell indices.
+        order: (T,) int64 cells, as kernels number them.
         exact: Whether every ray from the eye is known to meet its cells in this order, up to rounding of the positions.
             False does not say that the order is wrong.
     """
@@ -51,108 +144,20 @@ class CellOrder:
     exact: bool
 
 
-def visibility_order(mesh: TetMesh, vertices: torch.Tensor) -> CellOrder:
-    """Order the cells of a mesh front to back, for all rays from the eye at once.
-
-    The order is exact for convex meshes unless cells overlap cyclically as seen from the eye, which in Delaunay meshes
-    they never do. In other meshes it is right along every stretch of a ray that does not leave the mesh, and across
-    gaps if the cells are part of a Delaunay mesh. Loose cells are sorted by the distance of their centroids.
-
-    Args:
-        mesh: The cells, and their positions in any frame.
-        vertices: (V, 3) float32 or float64, the positions in camera space: the eye is the origin. Detached.
-
-    Returns:
-        The order, on the device of the vertices.
-    """
-    positions = _in_unit_range(vertices)
-    if not mesh.is_conforming:
-        return CellOrder(torch.argsort(_squared_distances(positions, mesh.tets)), exact=False)
-    keys, predecessors = _keys_and_predecessors(positions, mesh, torch.finfo(vertices.dtype).eps)
-    acyclic = _move_behind_predecessors(keys, predecessors, mesh.topology.cell_adjacency)
-    return CellOrder(torch.argsort(keys[:-1]), acyclic and is_convex(mesh.vertices, mesh.topology))
-
-
-def _in_unit_range(vertices: torch.Tensor) -> torch.Tensor:
-    """Positions in float64, scaled by a power of two to be at most 1, so that their products stay in range."""
-    positions = vertices.detach().double()
-    _, exponent = torch.frexp(positions.abs().max())
-    return positions * torch.exp2(-exponent.double().clamp(-1000, 1000))
-
-
-def _squared_distances(positions: torch.Tensor, tets: torch.Tensor) -> torch.Tensor:
-    """(T,) squared distances of the cells' centroids from the eye, times 16."""
-    parts = []
-    for part in chunks(tets.shape[0], tets.device, width=3):
-        a, b, c, d = (positions.index_select(0, column) for column in tets[part].unbind(1))
-        parts.append((a + b + c + d).square().sum(1))
-    return torch.cat(parts)
-
-
-def _keys_and_predecessors(
-    positions: torch.Tensor, mesh: TetMesh, rounding: float
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """What to sort cells by unless faces object, and the cells that have to come before each.
-
-    Args:
-        positions: (V, 3) float64 in camera space, at most 1.
-        mesh: The cells.
-        rounding: By how much the positions may be off.
-
-    Returns:
-        keys: (T + 1,) int64; the last belongs to no cell, and is below all others.
-        predecessors: (T, 4) int32, the cell across the face opposite local vertex k if it is nearer, else T.
-    """
-    count, tets, adjacency = mesh.num_cells, mesh.tets, mesh.topology.cell_adjacency
-    keys = torch.full((count + 1,), _FIRST, dtype=torch.int64, device=tets.device)
-    predecessors = torch.empty((count, 4), dtype=torch.int32, device=tets.device)
-    for part in chunks(count, tets.device, width=4):
-        cells = CellShape.of(positions, tets[part])
-        keys[part] = _ordered_bits(_eye_powers(cells, rounding))
-        neighbors = adjacency[part]
-        predecessors[part] = torch.where(_eye_is_beyond(cells).t() & (neighbors >= 0), neighbors, count)
-    return keys, predecessors
-
-
-def _eye_powers(cells: CellShape, rounding: float) -> torch.Tensor:
-    """(N,) power of the eye with respect to each circumsphere, |center|^2 - radius^2.
-
-    Where rounding of the positions moves the centre too far, the sphere around the centroid with the mean square
-    distance of the corners stands in, if the eye's power is smaller there: a cell too far in front is soon moved back,
-    one too far behind moves many.
-    """
-    diameters = cells.diameters()
-    powers = dot(cells.origin, cells.origin + diameters)
-    spread = sum(cells.edges[1:], cells.edges[0]) / 4.0
-    centroid = cells.origin + spread
-    stand_in = dot(centroid, centroid) + dot(spread, spread) - cells.squares.sum(0) / 4.0
-    longest = cells.squares.amax(0).sqrt()
-    reach = dot(diameters, diameters).sqrt() + longest
-    sure = rounding * reach * longest < _SURE * cells.determinants
-    return torch.where(sure, powers, torch.fmin(powers, stand_in))
-
-
-def _eye_is_beyond(cells: CellShape) -> torch.Tensor:
-    """(4, N) whether the face opposite local vertex k has the eye on the outside for certain.
-
-    Cells that rounding turned inside out do not know in from out and say False.
-    """
-    beside = [dot(normal, cells.origin) for normal in cells.normals]
-    opposite = -sum(beside, cells.determinants)
-    longest = cells.squares.amax(0).sqrt()
-    reach = dot(cells.origin, cells.origin).sqrt() + longest
-    certain = torch.stack((opposite, *beside)) > _SIGN_CERTAIN * longest * reach.square()
-    return certain & (cells.determinants > 0)
-
-
-def _ordered_bits(values: torch.Tensor) -> torch.Tensor:
-    """Float64 values as int64 in the same order, the next number being the next value."""
-    bits = values.view(torch.int64)
-    return torch.where(bits < 0, bits ^ _EXPONENT_AND_FRACTION, bits)
+def _uploaded_creases(backend: Backend, topology: Topology) -> tuple[Any, Any]:
+    """Flat (E, 4) edges of the boundary with the far corners of the faces beside them, and (E,) their numbers."""
+    creases = boundary_creases(topology)
+    assert creases is not None
+    return backend.uints(creases.to(torch.int32)), backend.lanes(len(creases))
 
 
 def _move_behind_predecessors(keys: torch.Tensor, predecessors: torch.Tensor, adjacency: torch.Tensor) -> bool:
     """Raise keys, in place, by as little as makes each greater than those of all its predecessors.
+
+    Args:
+        keys: (T + 1,) int64; the last belongs to no cell, and is below all others.
+        predecessors: (T, 4) int32, the cell across the face opposite local vertex k if it is nearer, else T.
+        adjacency: (T, 4) int32 cells behind the faces.
 
     Cells that moved pass it on to those behind them. That is quick if few do; otherwise all cells take their turn.
 

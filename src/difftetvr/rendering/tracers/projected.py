@@ -19,7 +19,7 @@ from difftetvr.mesh import TetMesh
 from difftetvr.rendering.search.bundle_hits import Stretches
 from difftetvr.rendering.search.scene import Scene
 from difftetvr.rendering.tracers.aim import Aim
-from difftetvr.rendering.tracers.cell_order import visibility_order
+from difftetvr.rendering.tracers.cell_order import KeyedCells, OrderPlan
 from difftetvr.rendering.tracers.tiles import TILE_BITS, TileLists, Tiler
 from difftetvr.rendering.traversal.crossing import Kernel, View, cross_cell
 from difftetvr.rendering.traversal.rays import Lanes
@@ -51,14 +51,15 @@ class Projected:
     starts_inside: bool
 
     @staticmethod
-    def plan(backend: Backend, mesh: TetMesh, rays: Any, stretches: Stretches | None) -> None:
-        """Nothing is looked for along rays."""
+    def plan(backend: Backend, mesh: TetMesh, rays: Any, stretches: Stretches | None) -> OrderPlan:
+        """How to sort the cells."""
+        return OrderPlan.of(backend, mesh)
 
     @staticmethod
     def of(aim: Aim) -> Projected:
-        """Order the cells of a mesh in camera space."""
-        vertices = aim.positions
-        cells = visibility_order(aim.order.mesh(aim.mesh), vertices)
+        """Sort the cells front to back, and into tiles."""
+        found: KeyedCells = aim.found
+        cells = found.sorted(aim.view.backend, aim.order.topology)
         if not cells.exact:
             warnings.warn(
                 "The cells of this mesh have no certain front-to-back order for the whole view (it is not convex, has "
@@ -67,10 +68,12 @@ class Projected:
                 OrderWarning,
                 stacklevel=2,
             )
-        starts_inside = bool(vertices[:, 2].amin() <= 0)
-        tiler = Tiler(aim.scene, cells.order, PAIR_BUDGET)
+        told = found.told
+        # The total may have run over where it could be so great.
+        pairs = told.total if told.most * len(cells.order) < 1 << 32 else None
+        tiler = Tiler(aim.scene, found.tiles, cells.order, pairs, PAIR_BUDGET)
         parts = [*tiler.lists()] if len(tiler.parts) < 2 else tiler
-        return Projected(aim.view, aim.scene, tiler.columns, parts, starts_inside)
+        return Projected(aim.view, aim.scene, tiler.columns, parts, found.starts_inside)
 
     def on_lanes(self, lane: Any) -> None:
         """See :meth:`difftetvr.rendering.traversal.crossing.Tracer.on_lanes`."""

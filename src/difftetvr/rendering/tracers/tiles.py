@@ -9,8 +9,10 @@ from typing import Any
 import drjit as dr
 import torch
 
+from difftetvr.backend import Backend
+from difftetvr.recording import few_lengths, replayed
 from difftetvr.rendering.search.scene import Scene
-from difftetvr.rendering.tracers.bands import bands_of
+from difftetvr.rendering.tracers.bands import Band, bands_of
 
 TILE_BITS = 2
 """Tiles have 4 x 4 pixels: those of 16 lanes that lie side by side in Morton order, a vector of AVX-512."""
@@ -30,59 +32,123 @@ class TileLists:
     cells: Any
 
 
+@dataclass
+class CellTiles:
+    """The tiles through which each cell may be seen, a rectangle of them.
+
+    Attributes:
+        pairs: (T,) how many these are.
+        width: (T,) how many in a row.
+        first: (T,) the first of them.
+    """
+
+    pairs: Any
+    width: Any
+    first: Any
+
+
+def tiles_of(scene: Scene, cell: Any) -> CellTiles:
+    """Find the tiles of cells, for :func:`difftetvr.recording.replayed`.
+
+    Args:
+        scene: The cells, and the rays of a camera.
+        cell: (T,) their numbers.
+    """
+    backend, image = scene.backend, scene.image
+    uint, integer = backend.UInt, backend.Int
+    corners = scene.cell(cell)
+    columns, rows, visible = image.pixel_range(backend, [scene.point(corners[k]) for k in range(4)])
+    column0, column1, row0, row1 = (uint(dr.select(visible, end, 0)) >> TILE_BITS for end in (*columns, *rows))
+    width = integer(column1 - column0 + 1)
+    pairs = dr.select(visible, width * integer(row1 - row0 + 1), 0)
+    first = integer(row0 * _tiles(image.width) + column0)
+    dr.eval(pairs, width, first)
+    return CellTiles(pairs, width, first)
+
+
 class Tiler:
     """Sorts the cells of a view into tiles, some at a time."""
 
-    def __init__(self, scene: Scene, order: torch.Tensor, budget: int) -> None:
-        """Find the tiles of each cell.
+    def __init__(self, scene: Scene, tiles: CellTiles, order: torch.Tensor, pairs: int | None, budget: int) -> None:
+        """Take cells apart.
 
         Args:
             scene: The cells, and the rays of a camera.
+            tiles: Those of each cell.
             order: (T,) cell indices, front to back.
+            pairs: How many pairs of cell and tile there are; None where nobody knows.
             budget: Pairs of cell and tile to hold at a time; a single cell may have more.
         """
-        self.scene = scene
-        width, height = scene.image.size
+        self.backend, (width, height) = scene.backend, scene.image.size
         self.columns = _tiles(width)
         self.count = self.columns * _tiles(height)
-        backend, uint = scene.backend, scene.backend.UInt
-        cell = backend.uints(order.to(torch.int32))
-        corners = scene.cell(cell)
-        columns, rows, visible = scene.image.pixel_range(scene.backend, [scene.point(corners[k]) for k in range(4)])
-        shift = lambda value: uint(dr.select(visible, value, 0)) >> TILE_BITS  # noqa: E731
-        column0, column1, row0, row1 = (shift(value) for value in (*columns, *rows))
-        self.width = backend.Int(column1 - column0 + 1)
-        pairs = dr.select(visible, self.width * backend.Int(row1 - row0 + 1), 0)
-        self.first = backend.Int(row0 * self.columns + column0)
-        backend.run(pairs, self.width, self.first)
-        seen = torch.nonzero(backend.tensor(pairs) > 0).flatten()
-        # Cells out of sight are left out: often they are most of all.
-        self.cells = order.to(torch.int32)[seen]
-        self.pairs, self.width, self.first = (backend.tensor(part)[seen] for part in (pairs, self.width, self.first))
-        self.parts = [slice(band.first, band.last) for band in bands_of(self.pairs.long(), budget)]
+        self.cells = order.to(torch.int32)
+        rows = (self.backend.tensor(part) for part in (tiles.pairs, tiles.width, tiles.first))
+        self.pairs, self.width, self.first = (row.index_select(0, order) for row in rows)
+        is_one = pairs is not None and pairs <= budget
+        bands = [Band(0, len(order), pairs or 0)] if is_one else bands_of(self.pairs.long(), budget)
+        self.parts = [band for band in bands if band.total]
 
     def lists(self) -> Iterator[TileLists]:
         """Lists of the first cells of the order, then of the next, and so on."""
         return (self._lists(part) for part in self.parts)
 
-    def _lists(self, part: slice) -> TileLists:
-        backend = self.scene.backend
-        pairs, width, first = self.pairs[part], self.width[part], self.first[part]
-        owner = torch.repeat_interleave(torch.arange(pairs.shape[0], device=pairs.device, dtype=torch.int32), pairs)
-        place = torch.arange(owner.shape[0], device=pairs.device, dtype=torch.int32)
-        place -= (pairs.cumsum(0) - pairs).to(torch.int32)[owner]
-        row = torch.div(place, width[owner], rounding_mode="floor")
-        tiles = first[owner] + row * self.columns + (place - row * width[owner])
+    def _lists(self, part: Band) -> TileLists:
+        backend, cells = self.backend, slice(part.first, part.last)
+        pairs = self.pairs[cells]
+        source = _Rectangles(
+            backend,
+            backend.uints(pairs),
+            backend.uints(self.width[cells]),
+            backend.uints(self.first[cells]),
+            backend.uints(pairs.cumsum(0) - pairs),
+            backend.uints(self.cells[cells]),
+            backend.constant(self.columns),
+        )
+        found = replayed(_pairs_of, source, few_lengths(part.total))
+        tiles, owners = (backend.tensor(row)[: part.total] for row in found)
         # Stable: within a tile, cells stay in their order.
         tiles, permutation = torch.sort(tiles, stable=True)
         bounds = torch.searchsorted(tiles, torch.arange(self.count + 1, device=tiles.device, dtype=tiles.dtype))
         bounds = bounds.to(torch.int32)
-        lists = TileLists(
-            backend.uints(bounds[:-1]), backend.uints(bounds[1:]), backend.uints(self.cells[part][owner[permutation]])
-        )
+        lists = TileLists(*(backend.uints(row) for row in (bounds[:-1], bounds[1:], owners[permutation])))
         backend.run(lists)
         return lists
 
 
-def _tiles(pixels: int) -> int:
-    return -(-pixels // (1 << TILE_BITS))
+@dataclass
+class _Rectangles:
+    """The tiles of some cells, see :class:`CellTiles`; where their pairs begin among all, and the cells' numbers."""
+
+    backend: Backend
+    pairs: Any
+    width: Any
+    first: Any
+    begin: Any
+    cell: Any
+    columns: Any
+
+
+def _pairs_of(source: _Rectangles, length: int) -> tuple[Any, Any]:
+    """(length,) tiles and (length,) cells of all pairs, cell by cell; for :func:`difftetvr.recording.replayed`."""
+    integer, uint = source.backend.Int, source.backend.UInt
+    tiles, cells = dr.empty(integer, length), dr.empty(integer, length)
+    pairs, width, begin, cell = (uint(part) for part in (source.pairs, source.width, source.begin, source.cell))
+
+    def write(place: Any, column: Any, tile: Any) -> tuple[Any, Any, Any]:
+        dr.scatter(tiles, integer(tile), begin + place)
+        dr.scatter(cells, integer(cell), begin + place)
+        # Without a division: in lanes that are done it would be by 0, which stops the program.
+        is_last = column + 1 == width
+        step = dr.select(is_last, source.columns - width + 1, uint(1))
+        return place + 1, dr.select(is_last, uint(0), column + 1), tile + step
+
+    state = (uint(0), uint(0), uint(source.first))
+    dr.while_loop(state, lambda place, column, tile: place < pairs, write)
+    dr.eval(tiles, cells)
+    return tiles, cells
+
+
+def _tiles(pixels: Any) -> Any:
+    """How many tiles hold so many pixels in a row."""
+    return (pixels + ((1 << TILE_BITS) - 1)) >> TILE_BITS
