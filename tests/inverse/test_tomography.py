@@ -123,7 +123,7 @@ def test_cameras_stand_for_detectors_where_they_can() -> None:
 
 
 def densities_of(mesh: TetMesh, scan: Measurements, values: torch.Tensor) -> Densities:
-    densities = Densities(mesh, scan.density_unit, 0.1, (0.9, 0.99))
+    densities = Densities(mesh, scan.density_unit, (0.9, 0.99))
     densities.values = values
     return densities
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import torch
+from torch.optim.adam import adam
 
 from difftetvr.fitting.config import FitConfig
 from difftetvr.mesh.changes.change import MeshChange
@@ -12,37 +13,35 @@ from difftetvr.mesh.field import Field
 from difftetvr.mesh.harmonics import COUNTS
 from difftetvr.mesh.tetmesh import TetMesh
 
-_FIRST, _SECOND = "exp_avg", "exp_avg_sq"  # Adam's names of its moments
+_STEP, _FIRST, _SECOND = "step", "exp_avg", "exp_avg_sq"  # Adam's names of its state
 # Gradients of a mean over pixels shrink as cells and pixels do; Adam's usual 1e-8 would drown those of fine meshes.
 _EPSILON = 1e-15
 
 
 class CarriedAdam:
-    """Adam for values on the vertices or cells of a mesh, whose moments follow changes of the mesh."""
+    """Adam for values on the vertices or cells of a mesh, whose moments follow changes of the mesh.
 
-    def __init__(self, groups: Sequence[Sequence[torch.Tensor]], rate: float, betas: tuple[float, float]) -> None:
+    PyTorch's function, not its class: that imports the compiler, which takes longer than ten steps of a fit.
+    """
+
+    def __init__(self, groups: Sequence[Sequence[torch.Tensor]], betas: tuple[float, float]) -> None:
         """Starts at rest.
 
         Args:
             groups: Leaf tensors, (N, ...), those that share a learning rate together.
-            rate: Learning rate until the first step says another.
             betas: Decay of first and second moments.
         """
-        options = [{"params": list(group)} for group in groups if group]
-        self._optimizer = torch.optim.Adam(options, lr=rate, betas=betas, eps=_EPSILON, fused=True)
-        # Adam would make its state in the first step; made here, a checkpoint holds the same arrays from the start.
-        for parameter in (parameter for group in groups for parameter in group):
+        self._groups = [list(group) for group in groups if group]
+        self._betas = betas
+        self._states: dict[torch.Tensor, dict[str, torch.Tensor]] = {}
+        for parameter in (parameter for group in self._groups for parameter in group):
             zeros = torch.zeros_like(parameter, requires_grad=False)
-            self._optimizer.state[parameter] = {
-                "step": torch.zeros((), device=parameter.device),
-                _FIRST: zeros,
-                _SECOND: zeros.clone(),
-            }
+            count = torch.zeros((), device=parameter.device)
+            self._states[parameter] = {_STEP: count, _FIRST: zeros, _SECOND: zeros.clone()}
 
     def state(self, parameter: torch.Tensor) -> dict[str, torch.Tensor]:
         """Moments of a parameter, and its count of steps, by name."""
-        found: dict[str, torch.Tensor] = self._optimizer.state[parameter]
-        return found
+        return self._states[parameter]
 
     def carry(self, parameter: torch.Tensor, value: torch.Tensor, change: MeshChange) -> torch.Tensor:
         """A parameter's successor on the mesh after a change, at rest where vertices are new.
@@ -55,26 +54,45 @@ class CarriedAdam:
             value: (N', ...) its value after it.
             change: What was done to the mesh.
         """
-        state = self._optimizer.state.pop(parameter)
+        state = self._states.pop(parameter)
         first = change.carry(state[_FIRST])
         is_new = change.is_new.view(-1, *[1] * (first.ndim - 1))
         state[_FIRST] = torch.where(is_new, 0.0, first)
         state[_SECOND] = change.carry(state[_SECOND])
         carried = value.requires_grad_()
-        self._optimizer.state[carried] = state
-        for group in self._optimizer.param_groups:
-            group["params"] = [carried if one is parameter else one for one in group["params"]]
+        self._states[carried] = state
+        self._groups = [[carried if one is parameter else one for one in group] for group in self._groups]
         return carried
 
     def zero_grad(self) -> None:
         """Forgets the gradients."""
-        self._optimizer.zero_grad(set_to_none=True)
+        for parameter in self._states:
+            parameter.grad = None
 
+    @torch.no_grad()
     def step(self, rates: Sequence[float]) -> None:
         """One step with the accumulated gradients, and a rate for each group."""
-        for group, rate in zip(self._optimizer.param_groups, rates):
-            group["lr"] = rate
-        self._optimizer.step()
+        for group, rate in zip(self._groups, rates):
+            trained = [parameter for parameter in group if parameter.grad is not None]
+            if not trained:
+                continue
+            states = [self._states[parameter] for parameter in trained]
+            adam(
+                trained,
+                [parameter.grad for parameter in trained if parameter.grad is not None],
+                [state[_FIRST] for state in states],
+                [state[_SECOND] for state in states],
+                [],
+                [state[_STEP] for state in states],
+                fused=True,
+                amsgrad=False,
+                beta1=self._betas[0],
+                beta2=self._betas[1],
+                lr=rate,
+                weight_decay=0.0,
+                eps=_EPSILON,
+                maximize=False,
+            )
 
 
 class FieldParameters:
@@ -122,7 +140,7 @@ class FieldParameters:
         self.color, self.density = color.requires_grad_(), density.requires_grad_()
         self.harmonics = None if harmonics is None else harmonics.requires_grad_()
         self._shares = [1.0, config.density_rate or 1.0, config.harmonics_rate]
-        self._optimizer = CarriedAdam(self._groups(), config.rate, config.betas)
+        self._optimizer = CarriedAdam(self._groups(), config.betas)
 
     def field(self, bands: int) -> Field:
         """The field that the parameters stand for, differentiable in them.

@@ -90,7 +90,7 @@ class ScalarReconstruction(AdaptiveRun):
         self._truth = Truth(capture, device).keep(self._train_views + self._glanced_views())
         if scalars is None:
             scalars = torch.full((mesh.num_vertices,), self._best_constant())
-        self.scalars = Scalars(scalars.to(device), config.rate, config.betas)
+        self.scalars = Scalars(scalars.to(device), config.betas)
         self.iteration, self.history = 0, History()
         self._unread = Unread()
 

@@ -15,16 +15,15 @@ class Scalars:
         values: (V,) leaf tensor.
     """
 
-    def __init__(self, values: torch.Tensor, rate: float, betas: tuple[float, float]) -> None:
+    def __init__(self, values: torch.Tensor, betas: tuple[float, float]) -> None:
         """Starts at rest.
 
         Args:
             values: (V,) those to begin with.
-            rate: Learning rate until the first step says another.
             betas: Decay of first and second moments.
         """
         self.values = values.detach().clone().requires_grad_()
-        self._optimizer = CarriedAdam([[self.values]], rate, betas)
+        self._optimizer = CarriedAdam([[self.values]], betas)
 
     def carry(self, change: MeshChange) -> None:
         """Follows a change of the mesh; new vertices start with interpolated scalars."""

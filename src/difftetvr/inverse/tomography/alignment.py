@@ -47,7 +47,7 @@ class Alignment:
         for leaf in self._leaves:
             leaf.requires_grad_()
         self._rates = [1.0, _TILT_PER_PIXEL / width, 1.0][:count]
-        self._optimizer = CarriedAdam([[leaf] for leaf in self._leaves], 0.0, _BETAS) if self._leaves else None
+        self._optimizer = CarriedAdam([[leaf] for leaf in self._leaves], _BETAS) if self._leaves else None
 
     @property
     def is_learned(self) -> bool:

@@ -21,12 +21,12 @@ class Densities:
         is_free: (V,) bool, where the density is and stays 0.
     """
 
-    def __init__(self, mesh: TetMesh, unit: float, rate: float, betas: tuple[float, float]) -> None:
+    def __init__(self, mesh: TetMesh, unit: float, betas: tuple[float, float]) -> None:
         """Half the mean density everywhere."""
         self.unit = unit
         self.values = torch.full((mesh.num_vertices,), _START, device=mesh.vertices.device).requires_grad_()
         self.is_free = torch.zeros_like(self.values, dtype=torch.bool)
-        self._optimizer = CarriedAdam([[self.values]], rate, betas)
+        self._optimizer = CarriedAdam([[self.values]], betas)
 
     def field(self) -> Field:
         """The field that the parameters stand for, differentiable in them."""

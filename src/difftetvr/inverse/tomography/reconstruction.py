@@ -70,7 +70,7 @@ class Reconstruction(AdaptiveRun):
         self._train_views, self._test_views = self.measurements.train, self.measurements.test
         self._mesh = (mesh or _grid(capture, config, self.strategy)).to(device=device)
         self.positions = VertexOptimizer(self._mesh, config.motion) if config.move else None
-        self.densities = Densities(self._mesh, self.measurements.density_unit, config.rate, config.betas)
+        self.densities = Densities(self._mesh, self.measurements.density_unit, config.betas)
         self._outside = OutsideSupport.of(config.support, capture.geometry, device) if config.support else None
         self._keep_free()
         shift = 0.0 if config.align == "none" else self.measurements.axis_shift()
