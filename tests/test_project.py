@@ -215,6 +215,18 @@ def test_importing_the_package_asks_for_no_optional_package():
     assert done.stdout.strip() == "[]"
 
 
+def test_a_fit_does_not_import_the_compiler():
+    code = """
+import sys, difftetvr as dtv
+capture = dtv.load_capture("tooth", views=4, width=32, height=32, steps_per_unit=100.0)
+dtv.fit(capture, dtv.FitConfig(cells=500, iterations=3))
+print("torch._dynamo" in sys.modules)
+"""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    assert done.stdout.strip().endswith("False"), done.stdout + done.stderr
+
+
 def test_functions_hide_no_packages():
     import pydoc
 
