@@ -123,6 +123,7 @@ def _counted(given: GivenBundle, mesh: TetMesh, backend: Backend, unit: float) -
         wide.constant(unit),
     )
     counted: CountedRays = replayed(recount, arrays)
+    backend.run(counted.flags)  # before the arrays go, of which some may be copies
     return counted
 
 
