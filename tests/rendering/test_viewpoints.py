@@ -89,6 +89,19 @@ def test_parallel_rays_see_colours_of_their_direction() -> None:
     torch.testing.assert_close(render(mesh, seen, camera).color, render(mesh, seen, far).color, rtol=0.0, atol=1e-4)
 
 
+def test_a_lone_ray_among_parallel_ones_has_colours_of_its_direction() -> None:
+    mesh, field = scene()
+    harmonics = torch.randn(mesh.num_vertices, 8, 3, dtype=torch.float64)
+    seen = Field(field.color, field.density, harmonics=harmonics)
+    ways = torch.tensor([[0.1, 0.2, -1.0], [-1.0, 0.3, 0.2]], dtype=torch.float64)
+    directions = ways[[0, 0, 0, 1]]
+    through = torch.rand(4, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(4))
+    found = render(mesh, seen, Rays(through - 2.0 * directions, directions))
+    lone = render(mesh, seen.seen_along(ways[1]), Rays(through[3] - 2.0 * ways[1], ways[1]))
+    assert float(lone.alpha) > 0.1
+    torch.testing.assert_close(found.color[3], lone.color)
+
+
 def test_a_lens_sees_colours_that_depend_on_the_direction() -> None:
     mesh, field = scene()
     harmonics = torch.randn(mesh.num_vertices, 8, 3, dtype=torch.float64)

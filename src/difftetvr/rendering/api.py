@@ -148,7 +148,10 @@ def render(
     is_directional = getattr(field, "harmonics", None) is not None
 
     def one(view: RaySource | Rays) -> RenderedImage:
-        look = lambda part: _render(mesh, field, part, background, options, clip_plane)  # noqa: E731
+        def look(part: RaySource | Rays, is_parallel: bool = False) -> RenderedImage:
+            how = replace(options, is_parallel=is_parallel) if is_parallel else options
+            return _render(mesh, field, part, background, how, clip_plane)
+
         return _of_viewpoints(look, view) if is_directional else look(view)
 
     if not isinstance(camera, Sequence):
@@ -169,7 +172,7 @@ def render(
     return tuple(parts)
 
 
-def _of_viewpoints(one: Callable[[RaySource | Rays], RenderedImage], camera: Any) -> RenderedImage:
+def _of_viewpoints(one: Callable[..., RenderedImage], camera: Any) -> RenderedImage:
     """What a camera or rays see of colours that depend on the direction: apart for all points from where they look.
 
     Raises:
@@ -180,7 +183,7 @@ def _of_viewpoints(one: Callable[[RaySource | Rays], RenderedImage], camera: Any
     rays = as_rays(camera)
     if rays.eye is not None:
         return one(rays)
-    parts = rays.by_viewpoint()
+    parts, are_parallel = rays.by_viewpoint()
     if len(parts) < 2:
         return one(rays)
     if len(parts) > _MOST_VIEWPOINTS:
@@ -189,7 +192,7 @@ def _of_viewpoints(one: Callable[[RaySource | Rays], RenderedImage], camera: Any
             f"go in no fewer directions; pass rays from {_MOST_VIEWPOINTS:,} points at most, or a field without "
             "harmonics."
         )
-    images = [one(part) for _, part in parts]
+    images = [one(part, are_parallel) for _, part in parts]
     place = torch.argsort(torch.cat([place for place, _ in parts])).to(images[0].alpha.device)
     names = [field.name for field in fields(RenderedImage)]
     joined = RenderedImage(*(torch.cat([getattr(image, name) for image in images]) for name in names))

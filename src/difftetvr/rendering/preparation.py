@@ -35,12 +35,18 @@ _SMALL = 1 / LARGEST  # between these, coordinates are left as they are
 
 @dataclass(frozen=True)
 class ViewOptions:
-    """How a view is rendered; see :func:`difftetvr.render`."""
+    """How a view is rendered; see :func:`difftetvr.render`.
+
+    Attributes:
+        is_parallel: Whether colours that depend on the direction are those of parallel rays also where rays share the
+            point where they start, as a single one does.
+    """
 
     optics: OpticalModel | None = None
     transmittance_threshold: float = 0.0
     deterministic: bool = False
     renderer: str = "marching"
+    is_parallel: bool = False
 
 
 @dataclass(frozen=True)
@@ -122,7 +128,7 @@ def prepare_view(
     options = _checked(mesh, field, camera, options)
     require_own_threads()  # here already, since in a copy of a process torch may hang, too
     source = camera.relative_to(mesh.origin) if is_plain(camera) else as_rays(camera)
-    field, viewpoint = _seen(mesh, field, source)
+    field, viewpoint = _seen(mesh, field, source, options.is_parallel)
     content, parts = _content(mesh, field)
     for tensor in parts:
         if tensor.device != mesh.vertices.device:
@@ -243,7 +249,7 @@ def _checked(mesh: Any, field: Any, camera: Any, options: ViewOptions) -> ViewOp
     threshold = as_number(options.transmittance_threshold, "transmittance_threshold", DiffTetError)
     if not 0.0 <= threshold < 1.0:
         raise DiffTetError(f"transmittance_threshold is {threshold}; it must lie in [0, 1).")
-    return ViewOptions(optics, threshold, options.deterministic, renderer)
+    return replace(options, transmittance_threshold=threshold)
 
 
 def is_plain(camera: RaySource | Rays) -> TypeGuard[Camera]:
@@ -257,13 +263,13 @@ def as_rays(camera: RaySource | Rays) -> Rays:
 
 
 def _seen(
-    mesh: TetMesh, field: Field | ScalarField | CellFeatures, camera: Camera | Rays
+    mesh: TetMesh, field: Field | ScalarField | CellFeatures, camera: Camera | Rays, is_parallel: bool
 ) -> tuple[Field | ScalarField | CellFeatures, Viewpoint | None]:
     """A field without harmonics, as it is seen from a camera or along rays, and from where that is."""
     if not isinstance(field, Field) or field.harmonics is None:
         return field, None
     field.validate(mesh)
-    viewpoint = Viewpoint.of(mesh, camera)
+    viewpoint = Viewpoint.of(mesh, camera, is_parallel)
     return viewpoint.seen(field, mesh), viewpoint
 
 

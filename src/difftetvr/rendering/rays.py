@@ -111,21 +111,24 @@ class Rays:
         eye = self.eye
         return self.origins if eye is None else eye
 
-    def by_viewpoint(self) -> list[tuple[torch.Tensor, Rays]]:
+    def by_viewpoint(self) -> tuple[list[tuple[torch.Tensor, Rays]], bool]:
         """The rays apart by what they share: a point where they start, or, of parallel ones, where they go.
 
         They count as parallel where they have fewer directions than origins, value for value. Differentiable.
 
         Returns:
-            (M,) places in this bundle, counted through all of its shape, and the (M,) rays there, for each.
+            (M,) places in this bundle, counted through all of its shape, and the (M,) rays there, for each; and whether
+            they are parallel.
         """
         origins, directions = self.origins.reshape(-1, 3), self.directions.reshape(-1, 3)
         groups = [torch.unique(part.detach(), dim=0, return_inverse=True)[1] for part in (origins, directions)]
         counts = [int(group.max()) + 1 if group.numel() else 0 for group in groups]
-        group, count = min(zip(groups, counts, strict=True), key=lambda pair: pair[1])
+        are_parallel = counts[1] < counts[0]
+        group, count = groups[are_parallel], counts[are_parallel]
         near, far = (end.reshape(-1) for end in self.ends)
         all_places = torch.split(torch.argsort(group, stable=True), torch.bincount(group, minlength=count).tolist())
-        return [(place, Rays(origins[place], directions[place], near[place], far[place])) for place in all_places]
+        parts = [(place, Rays(origins[place], directions[place], near[place], far[place])) for place in all_places]
+        return parts, are_parallel
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Rays:
         """The same rays on another device or in another precision; autograd sees them as a function of these.

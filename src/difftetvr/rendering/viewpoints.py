@@ -33,8 +33,13 @@ class Viewpoint:
     own: torch.Tensor | None
 
     @staticmethod
-    def of(mesh: TetMesh, camera: Camera | Rays) -> Viewpoint:
+    def of(mesh: TetMesh, camera: Camera | Rays, is_parallel: bool = False) -> Viewpoint:
         """Of a camera, which is relative to the mesh's origin, or of rays in world space.
+
+        Args:
+            mesh: The mesh.
+            camera: The camera, or the rays.
+            is_parallel: Whether rays that share both, as a single one does, count as parallel.
 
         Raises:
             DiffTetError: They share neither.
@@ -44,7 +49,8 @@ class Viewpoint:
         rays = camera.relative_to(mesh.origin)
         if not rays.shape.numel():
             return Viewpoint(mesh.vertices.new_zeros(3), False, None)
-        for vectors, is_direction in ((rays.origins, False), (rays.directions, True)):
+        both = ((rays.origins, False), (rays.directions, True))
+        for vectors, is_direction in both[::-1] if is_parallel else both:
             if (shared := one_vector(vectors)) is not None:
                 return Viewpoint(shared, is_direction, None)
             flat = vectors.reshape(-1, 3)
