@@ -53,6 +53,50 @@ def test_directions_of_any_length_mean_the_same(length: float) -> None:
     torch.testing.assert_close(at, expected_at)
 
 
+@pytest.mark.parametrize("least", [torch.tensor(2.0**-149), torch.tensor(2.0**-1074, dtype=torch.float64)])
+def test_directions_of_denormal_numbers_mean_the_same(least: Tensor) -> None:
+    """Kernels take such numbers for 0."""
+    mesh, field = scene()
+    origins, directions = random_rays(20)
+    directions = torch.round(1000.0 * directions).to(least.dtype)
+    expected, found = (render(mesh, field, Rays(origins, scale * directions)) for scale in (1.0, least))
+    assert float(expected.alpha.max()) > 0.1
+    torch.testing.assert_close(found.alpha, expected.alpha)
+    # The greatest component is none of them, others are.
+    mixed = torch.tensor([[1000.0, -999.0, 500.0]], dtype=least.dtype)
+    scale = torch.finfo(least.dtype).tiny / 999.5
+    expected, found = (render(mesh, field, Rays([0.1, 0.9, 0.2], mixed * factor)) for factor in (1.0, scale))
+    torch.testing.assert_close(found.alpha, expected.alpha)
+
+
+@pytest.mark.parametrize("unit", [2.0**-1000, 2.0**-530, 2.0**530, 2.0**1000])
+def test_rays_begin_inside_meshes_of_any_size(unit: float) -> None:
+    """The square of a mesh's size need not be a number."""
+    mesh, field = scene()
+    # All of them look to the middle, from inside of the mesh.
+    origins, directions = 0.55 + 0.4 * random_rays(20)[0][10:], torch.tensor([-1.0, -0.7, -0.9]).double()
+    expected = render(mesh, field, Rays(origins, directions))
+    scaled, thinned = mesh.with_vertices(unit * mesh.vertices), Field(field.color, field.density / unit)
+    torch.testing.assert_close(render(scaled, thinned, Rays(unit * origins, directions)).alpha, expected.alpha)
+
+
+def test_what_is_one_in_memory_has_derivatives_of_each_ray() -> None:
+    mesh, field = scene()
+    _, directions = random_rays(12)
+    parts = torch.tensor([0.4, 0.3, 0.6]).double(), torch.tensor(0.05).double(), torch.tensor(0.4).double()
+    weights = torch.linspace(1.0, 2.0, 12).double()
+
+    def derivatives(is_one: bool) -> tuple[Tensor, ...]:
+        rows = [part.expand(12, *part.shape) for part in parts]
+        leaves = [(row if is_one else row.contiguous()).detach().requires_grad_() for row in rows]
+        rays = Rays(leaves[0], directions, leaves[1], leaves[2])
+        return torch.autograd.grad((weights * render(mesh, field, rays).optical_depth).sum(), leaves)
+
+    for found, expected in zip(derivatives(True), derivatives(False), strict=True):
+        assert bool(expected.any())
+        torch.testing.assert_close(found, expected)
+
+
 @pytest.mark.filterwarnings("error")
 def test_rays_from_infinitely_far_away_end_where_they_are_told_to() -> None:
     mesh, field = scene()

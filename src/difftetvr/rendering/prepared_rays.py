@@ -24,10 +24,12 @@ KNOW_FLOAT64 = ("cpu", "cuda")
 class GivenBundle:
     """A bundle of rays as callers pass it, relative to the mesh's origin and where the mesh is.
 
+    What is one in memory for all rays still has a row for each: autograd asks for the derivatives of each.
+
     Attributes:
         count: N.
-        origins, directions: (N, 3), the directions of any length but 0; or (1, 3) where all have the same.
-        near, far: (N, 1) distances between which rays are looked at, in world units; or (1, 1).
+        origins, directions: (N, 3), the directions of any length but 0.
+        near, far: (N, 1) distances between which rays are looked at, in world units.
     """
 
     count: int
@@ -58,7 +60,7 @@ class PreparedRays:
         ends: Their limits there; None where nothing is known to be cut off.
         sees_all: (2,) flags there, the first of them 1 if no ray begins or ends near the mesh; None if nobody asks.
         begins_at_point: Whether all rays are known to be looked at from one point on.
-        near: (N,) or (1,) distances from the true origins from which on rays are looked at, in world units.
+        near: (N,) distances from the true origins from which on rays are looked at, in world units.
         lines, limits: (N, 6) and (N, 2), those of ``counted`` as autograd follows them; None where it need not.
     """
 
@@ -107,7 +109,8 @@ def _counted(given: GivenBundle, mesh: TetMesh, backend: Backend, unit: float) -
         return CountedRays(none, none, wide.Float(), wide.Float(), backend.Float(1, 1))
 
     def rows(part: torch.Tensor) -> Rows:
-        return Rows(backend.at(part.dtype).floats(part), int(len(part) > 1), part.shape[1])
+        one = one_vector(part)
+        return Rows(backend.at(part.dtype).floats(part if one is None else one), int(one is None), part.shape[1])
 
     arrays = GivenRays(
         backend,
@@ -128,15 +131,14 @@ def _counted(given: GivenBundle, mesh: TetMesh, backend: Backend, unit: float) -
 
 
 def _rows(values: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
-    """(N, width) of (..., width), or (1, width) where these are one in memory; where another tensor is."""
-    one = one_vector(values)
-    rows = values.reshape(-1, values.shape[-1]) if one is None else one[None]
+    """(N, width) of (..., width), where another tensor is."""
+    rows = values.reshape(-1, values.shape[-1])
     is_known = rows.dtype == torch.float32 or (rows.dtype == torch.float64 and like.device.type in KNOW_FLOAT64)
     return rows.to(like.device, rows.dtype if is_known else torch.float32)
 
 
 class _Recount(torch.autograd.Function):
-    """From (N, 3) origins and directions and (N, 1) ends of rays, or one row for all, to their lines and limits.
+    """From (N, 3) origins and directions and (N, 1) ends of rays to their lines and limits.
 
     Where on its line a ray is counted from is of no consequence, so its shift counts as constant.
     """
@@ -147,7 +149,7 @@ class _Recount(torch.autograd.Function):
         ctx.set_materialize_grads(False)
         lines, limits = backend.tensor(counted.lines, -1, 6), backend.tensor(counted.limits, -1, 2)
         shift, length = (backend.at(None).tensor(part) for part in (counted.shift, counted.length))
-        ctx.unit, ctx.rows = unit, [(part.shape, part.dtype) for part in rows]
+        ctx.unit, ctx.dtypes = unit, [part.dtype for part in rows]
         ctx.save_for_backward(lines, shift, length)
         return lines, limits
 
@@ -165,8 +167,5 @@ class _Recount(torch.autograd.Function):
             found[:2] = by_origin, (by_direction - along) / length[:, None]
         if by_limits is not None:
             found[2:] = (by_limits.to(shift.dtype) / ctx.unit).split(1, dim=1)
-        by_rows = (
-            None if part is None else part.sum_to_size(shape).to(dtype)
-            for part, (shape, dtype) in zip(found, ctx.rows, strict=True)
-        )
+        by_rows = (None if part is None else part.to(dtype) for part, dtype in zip(found, ctx.dtypes, strict=True))
         return None, None, None, *by_rows

@@ -13,6 +13,9 @@ from difftetvr.rendering.traversal.sums import raise_to
 _OUTSIDE = 1.001
 """Distance from a mesh's centre, in radii, from which on a ray surely sees all of the mesh."""
 
+_DENORMAL_UNITS = {dr.VarType.Float32: -149, dr.VarType.Float64: -1074}
+"""Exponents of the least numbers above 0, whose multiples kernels take for 0."""
+
 _REACH = 8
 """Floats of the greatest x, -x, y, -y, z and -z, and two more: one packet."""
 
@@ -31,10 +34,14 @@ class Rows:
     step: int
     width: int
 
-    def of(self, wide: Any, ray: Any) -> tuple[Any, ...]:
+    def of(self, wide: Any, ray: Any) -> list[Any]:
         """The rows of some rays in a precision."""
+        return [wide(value) for value in self.exact(ray)]
+
+    def exact(self, ray: Any) -> list[Any]:
+        """The rows of some rays in their own precision."""
         first = self.step * self.width * ray
-        return tuple(wide(dr.gather(type(self.array), self.array, first + k)) for k in range(self.width))
+        return [dr.gather(type(self.array), self.array, first + k) for k in range(self.width)]
 
 
 @dataclass
@@ -91,9 +98,8 @@ def recount(given: GivenRays) -> CountedRays:
     center, radius = _sphere(given)
     lines, limits = (dr.empty(backend.Float, width * given.count) for width in (6, 2))
     doubts = dr.zeros(backend.Float, 2)
-    origin, vector = given.origins.of(wide, ray), given.directions.of(wide, ray)
-    (near,), (far,) = given.near.of(wide, ray), given.far.of(wide, ray)
-    direction, length = _unit_vector(vector)
+    origin, (near,), (far,) = (rows.of(wide, ray) for rows in (given.origins, given.near, given.far))
+    direction, length = _unit_vector(wide, given.directions.exact(ray))
     shift = sum((c - o) * d for c, o, d in zip(center, origin, direction, strict=True))
     inverse = 1.0 / given.unit
     nearest = [dr.fma(shift, d, o) * inverse for o, d in zip(origin, direction, strict=True)]
@@ -102,7 +108,7 @@ def recount(given: GivenRays) -> CountedRays:
     dr.scatter(limits, backend.Float2(ends), ray)
     # The distance of the end from the origin is rounded as these are, whose difference it is.
     away = dr.fmin(shift - near, far - (1.0 + 1e-5) * dr.abs(shift))
-    _doubt(backend, doubts, 0, away >= _OUTSIDE * radius)
+    _doubt(backend, doubts, 0, away > _OUTSIDE * radius)
     begin, first = _begin(origin, near, direction), _begin_of_first(given)
     is_one = dr.mask_t(wide)(True)
     for value, other in zip(begin, first, strict=True):
@@ -130,29 +136,61 @@ def _sphere(given: GivenRays) -> tuple[list[Any], Any]:
     high, negative = ([dr.gather(wide, reach, uint(2 * axis + side)) for axis in range(3)] for side in range(2))
     center = [0.5 * h - 0.5 * n for h, n in zip(high, negative, strict=True)]
     half = [0.5 * h + 0.5 * n for h, n in zip(high, negative, strict=True)]
-    return center, dr.sqrt(half[0] * half[0] + half[1] * half[1] + half[2] * half[2])
+    scaled, scale = _in_range(wide, half)
+    return center, _length(scaled) / scale
 
 
-def _unit_vector(vector: tuple[Any, ...]) -> tuple[list[Any], Any]:
-    """A vector of length 1, of one of any length but 0, whose square need not be a number; and that length."""
-    real = type(vector[0])
-    edge = 400 if dr.type_v(real) == dr.VarType.Float64 else 50
-    largest = dr.fmax(dr.fmax(dr.abs(vector[0]), dr.abs(vector[1])), dr.abs(vector[2]))
-    is_short, is_long = largest < 2.0**-edge, largest > 2.0**edge
-    # Powers of two: vectors of common lengths come to the very bits they would come to without.
-    step = 2.0 ** (2 * edge)
-    scale = dr.select(is_short, real(step), dr.select(is_long, real(1 / step), real(1)))
-    scaled = [scale * value for value in vector]
-    length = dr.sqrt(scaled[0] * scaled[0] + scaled[1] * scaled[1] + scaled[2] * scaled[2])
+def _unit_vector(wide: Any, vector: list[Any]) -> tuple[list[Any], Any]:
+    """A vector of length 1 in a precision, of one of any length but 0; and that length."""
+    scaled, scale = _in_range(wide, vector)
+    length = _length(scaled)
     return [value / length for value in scaled], length / scale
 
 
-def _begin(origin: tuple[Any, ...], near: Any, direction: list[Any]) -> list[Any]:
+def _in_range(wide: Any, vector: list[Any]) -> tuple[list[Any], Any]:
+    """A vector in a precision, times a scale for which its square is a number and, unless the vector is 0, not 0."""
+    values, multiples = [wide(value) for value in vector], [_denormal_multiple(value) for value in vector]
+    real = type(vector[0])
+    scale, short_unit = wide(1), wide(2.0 ** _DENORMAL_UNITS[dr.type_v(real)])
+    if real is wide:  # float64 holds the squares of all numbers of float32
+        edge = 400 if dr.type_v(wide) == dr.VarType.Float64 else 50
+        largest = dr.fmax(dr.fmax(dr.abs(values[0]), dr.abs(values[1])), dr.abs(values[2]))
+        is_short, is_long = largest < 2.0**-edge, largest > 2.0**edge
+        # Powers of two: vectors of common lengths come to the very bits they would come to without.
+        step = 2.0 ** (2 * edge)
+        scale = dr.select(is_short, wide(step), dr.select(is_long, wide(1 / step), wide(1)))
+        # Beside numbers that are not as short, denormal ones are 0.
+        short_unit = dr.select(is_short, wide(2.0 ** (2 * edge + _DENORMAL_UNITS[dr.type_v(real)])), wide(0))
+    scaled = [
+        dr.select(multiple == 0, scale * value, short_unit * wide(multiple))
+        for value, multiple in zip(values, multiples, strict=True)
+    ]
+    return scaled, scale
+
+
+def _denormal_multiple(value: Any) -> Any:
+    """What a denormal number is in units of the least one, as an integer; 0 where a number is none.
+
+    By its bits, for kernels take such numbers for 0.
+    """
+    is_double = dr.type_v(type(value)) == dr.VarType.Float64
+    integer: Any = (dr.int64_array_t if is_double else dr.int32_array_t)(value)
+    bits: Any = dr.reinterpret_array(integer, value)
+    size = bits & (2**63 - 1 if is_double else 2**31 - 1)
+    multiple = dr.select(size < (2**52 if is_double else 2**23), size, 0)
+    return dr.select(bits < 0, -multiple, multiple)
+
+
+def _length(vector: list[Any]) -> Any:
+    return dr.sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2])
+
+
+def _begin(origin: list[Any], near: Any, direction: list[Any]) -> list[Any]:
     return [dr.fma(near, d, o) for o, d in zip(origin, direction, strict=True)]
 
 
 def _begin_of_first(given: GivenRays) -> list[Any]:
     first = given.backend.UInt(0)
     wide = given.wide
-    origin, vector = given.origins.of(wide, first), given.directions.of(wide, first)
-    return _begin(origin, given.near.of(wide, first)[0], _unit_vector(vector)[0])
+    (near,), direction = given.near.of(wide, first), _unit_vector(wide, given.directions.exact(first))[0]
+    return _begin(given.origins.of(wide, first), near, direction)
