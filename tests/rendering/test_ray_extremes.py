@@ -107,3 +107,13 @@ def test_rays_from_infinitely_far_away_end_where_they_are_told_to() -> None:
     for ends in ((math.inf, math.inf), (-math.inf, -math.inf)):
         with pytest.raises(CameraError, match="infinitely far away on one side"):
             Rays(origins, directions, *ends)
+
+
+@pytest.mark.parametrize("renderer", ["marching", "linked-list"])
+def test_a_ray_that_begins_on_the_boundary_is_not_lost(renderer: str) -> None:
+    """Where that point, told by its distance along the ray, is rounded out of the mesh's box."""
+    mesh, field = scene()
+    directions = torch.tensor([[1000.0, -999.0, 500.0]], dtype=torch.float64)
+    for step in range(40):
+        ray = Rays([0.0, 1.0, 0.2], directions * (1e-3 + 1e-5 * step))
+        assert float(render(mesh, field, ray, renderer=renderer).alpha) == pytest.approx(0.9654, abs=1e-3), step

@@ -140,11 +140,13 @@ def cells_around(scene: Scene, cell: Any, extent: Any, capacity: int, reach: Any
     backend, uint, real = scene.backend, scene.backend.UInt, scene.backend.Float
     ends = [real(0) if reach is None else dr.gather(real, reach, uint(k)) for k in range(6)]
     around, blur = backend.Bool(True), real(0)
+    farthest = [dr.gather(real, extent, uint(k)) for k in range(6)]
+    if reach is not None:
+        for k in range(6):
+            blur = dr.fmax(blur, dr.fmax(rounding_of(dr.abs(farthest[k])), ends[k] + ends[k ^ 1]))
     for k in range(6):
-        farthest = dr.gather(real, extent, uint(k))
-        around &= farthest >= -ends[k ^ 1]
-        if reach is not None:
-            blur = dr.fmax(blur, dr.fmax(rounding_of(dr.abs(farthest)), ends[k] + ends[k ^ 1]))
+        # Rounding may put a point on the boundary outside of the mesh's box.
+        around &= farthest[k] >= -ends[k ^ 1] - blur
     corners = scene.cell(cell, around)
     center = [0.5 * (ends[2 * axis] - ends[2 * axis + 1]) for axis in range(3)]
     points = [[x - c for x, c in zip(scene.point(corners[k], around), center, strict=True)] for k in range(4)]
