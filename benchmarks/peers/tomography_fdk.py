@@ -63,13 +63,16 @@ def feldkamp(scan: VoxelScan, size: int, options: Feldkamp) -> torch.Tensor:
     return _backprojected(values.float(), table.reshape(-1, _NUMBERS).float(), size).clamp_min_(0.0)
 
 
+def _of_each_view(geometry: ProjectionGeometry, rays: torch.Tensor) -> list[torch.Tensor]:
+    """(V, 3) centres of detectors, sources or directions of rays, and steps along columns and rows."""
+    detector = geometry.detector
+    return [part.expand(geometry.num_views, 3) for part in (detector.center, rays, detector.columns, detector.rows)]
+
+
 def _cone_views(geometry: ProjectionGeometry) -> _Views:
     detector = geometry.detector
     assert detector.source is not None
-    center, source, columns, rows = (
-        part.expand(geometry.num_views, 3)
-        for part in (detector.center, detector.source, detector.columns, detector.rows)
-    )
+    center, source, columns, rows = _of_each_view(geometry, detector.source)
     height, width = geometry.shape[1:]
     radius, distance = source[:, :2].norm(dim=1), (center - source).norm(dim=1)
     if float(radius.max() - radius.min()) > _EQUAL * float(radius.max()):
@@ -89,10 +92,7 @@ def _parallel_views(geometry: ProjectionGeometry) -> _Views:
     """Half a turn sees all there is to see, and what is far is seen as large as what is near."""
     detector = geometry.detector
     assert detector.direction is not None
-    center, direction, columns, rows = (
-        part.expand(geometry.num_views, 3)
-        for part in (detector.center, detector.direction, detector.columns, detector.rows)
-    )
+    center, direction, columns, rows = _of_each_view(geometry, detector.direction)
     across, down = columns.norm(dim=1, keepdim=True), rows.norm(dim=1, keepdim=True)
     unit, normal = direction / direction.norm(dim=1, keepdim=True), torch.linalg.cross(columns, rows)
     skew = torch.linalg.cross(unit, normal / normal.norm(dim=1, keepdim=True))

@@ -18,7 +18,7 @@ from difftetvr.rendering.cameras.pinhole import Camera
 from difftetvr.rendering.cell_features import CellFeatures
 from difftetvr.rendering.clip_plane import clip_limits
 from difftetvr.rendering.kernels.layout import LARGEST
-from difftetvr.rendering.prepared_rays import KNOW_FLOAT64, GivenBundle, PreparedRays
+from difftetvr.rendering.prepared_rays import GivenBundle, PreparedRays
 from difftetvr.rendering.rays import Rays, RaySource, image_order
 from difftetvr.rendering.scalar_field import ScalarField
 from difftetvr.rendering.task import TRACERS, Content, RenderTask
@@ -304,7 +304,7 @@ def _camera_space(mesh: TetMesh, camera: Camera) -> torch.Tensor:
 
 def _is_blurred(extent: Extent, camera: Camera, vertices: torch.Tensor) -> bool:
     """Whether float32 does not resolve what a camera sees of vertices of some extent, and float64 is there."""
-    if vertices.dtype != torch.float32 or vertices.device.type not in KNOW_FLOAT64:
+    if backend_for(vertices).at(None).dtype == vertices.dtype:
         return False
     if _is_remote(extent):
         return True

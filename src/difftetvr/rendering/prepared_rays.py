@@ -8,16 +8,13 @@ from typing import Any
 import torch
 from torch.autograd.function import once_differentiable
 
-from difftetvr.backend import Backend
+from difftetvr.backend import Backend, backend_for
 from difftetvr.mesh import TetMesh
 from difftetvr.recording import replayed
 from difftetvr.rendering.clip_plane import clip_rays
 from difftetvr.rendering.rays import Rays, one_vector, unit_vectors
 from difftetvr.rendering.search.memory_order import MemoryOrder
 from difftetvr.rendering.traversal.recount import CountedRays, GivenRays, Rows, recount
-
-KNOW_FLOAT64 = ("cpu", "cuda")
-"""Devices that compute in float64."""
 
 
 @dataclass(frozen=True)
@@ -42,10 +39,10 @@ class GivenBundle:
     def of(rays: Rays, mesh: TetMesh, clip_plane: Any) -> GivenBundle:
         """Rays before a plane, if there is one, see :func:`difftetvr.render`."""
         rays = rays.relative_to(mesh.origin)
-        origins, directions = (_rows(part, mesh.vertices) for part in (rays.origins, rays.directions))
-        near, far = (_rows(end[..., None], mesh.vertices) for end in rays.ends)
+        device, wide = mesh.vertices.device, backend_for(mesh.vertices).at(None).dtype
+        origins, directions = (_rows(part, device, wide) for part in (rays.origins, rays.directions))
+        near, far = (_rows(end[..., None], device, wide) for end in rays.ends)
         if clip_plane is not None:
-            wide = torch.float64 if mesh.vertices.device.type in KNOW_FLOAT64 else mesh.vertices.dtype
             first, last = clip_rays(clip_plane, origins.to(wide), unit_vectors(directions.to(wide)), mesh.origin)
             near, far = torch.maximum(near, first[:, None]), torch.minimum(far, last[:, None])
         return GivenBundle(rays.shape.numel(), origins, directions, near, far)
@@ -130,11 +127,10 @@ def _counted(given: GivenBundle, mesh: TetMesh, backend: Backend, unit: float) -
     return counted
 
 
-def _rows(values: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
-    """(N, width) of (..., width), where another tensor is."""
+def _rows(values: torch.Tensor, device: torch.device, wide: torch.dtype) -> torch.Tensor:
+    """(N, width) of (..., width) on a device, in float32 or the best precision that it knows."""
     rows = values.reshape(-1, values.shape[-1])
-    is_known = rows.dtype == torch.float32 or (rows.dtype == torch.float64 and like.device.type in KNOW_FLOAT64)
-    return rows.to(like.device, rows.dtype if is_known else torch.float32)
+    return rows.to(device, rows.dtype if rows.dtype in (torch.float32, wide) else torch.float32)
 
 
 class _Recount(torch.autograd.Function):

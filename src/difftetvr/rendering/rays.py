@@ -208,11 +208,7 @@ def unit_vectors(vectors: torch.Tensor) -> torch.Tensor:
     most = 1000 if vectors.dtype == torch.float64 else 120
     # A power of two: vectors of common lengths come to the very bits they would come to without.
     scale = torch.ldexp(torch.ones_like(vectors[..., :1]), -exponent.clamp(-most, most))
-    return short_unit_vectors(vectors * scale)
-
-
-def short_unit_vectors(vectors: torch.Tensor) -> torch.Tensor:
-    """The same of vectors whose squares are numbers."""
+    vectors = vectors * scale
     return vectors / torch.linalg.vector_norm(vectors, dim=-1, keepdim=True)
 
 

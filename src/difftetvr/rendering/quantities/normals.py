@@ -6,15 +6,13 @@ from collections.abc import Sequence
 
 import torch
 
-from difftetvr.backend import eager
+from difftetvr.backend import backend_for, eager
 from difftetvr.errors import MeshError
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.rendering.api import RenderedImage, render
 from difftetvr.rendering.cell_features import CellFeatures, medium_of
 from difftetvr.rendering.rays import Rays, RaySource
 from difftetvr.rendering.scalar_field import ScalarField
-
-_KNOW_FLOAT64 = ("cpu", "cuda")
 
 
 @eager
@@ -78,7 +76,7 @@ def cell_normals(mesh: TetMesh, values: torch.Tensor) -> torch.Tensor:
     Returns:
         (T, 3) unit vectors, 0 where the values of a cell are all the same; float64 where the device knows it.
     """
-    dtype = torch.float64 if mesh.vertices.device.type in _KNOW_FLOAT64 else mesh.vertices.dtype
+    dtype = backend_for(mesh.vertices).at(None).dtype
     corners, heights = (part.to(dtype)[mesh.tets.long()] for part in (mesh.vertices, values.to(mesh.vertices.device)))
     edges, rises = corners[:, 1:] - corners[:, :1], heights[:, 1:] - heights[:, :1]
     # In units of their own, so that no product vanishes or overflows, however small the cell or steep the field.

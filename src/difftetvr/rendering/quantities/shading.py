@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import torch
 
-from difftetvr.backend import eager
+from difftetvr.backend import backend_for, eager
 from difftetvr.errors import DiffTetError, shown
 from difftetvr.inputs import as_number, as_reals
 from difftetvr.mesh import Field, TetMesh
@@ -15,8 +15,6 @@ from difftetvr.rendering.api import render
 from difftetvr.rendering.cell_features import CellFeatures, medium_of
 from difftetvr.rendering.rays import Rays, RaySource
 from difftetvr.rendering.scalar_field import ScalarField
-
-_KNOW_FLOAT64 = ("cpu", "cuda")
 
 
 @eager
@@ -84,7 +82,7 @@ def smooth_gradients(mesh: TetMesh, medium: Field | ScalarField) -> torch.Tensor
         (T, 3) up to one factor for all cells, 0 where nothing changes; float64 where the device knows it.
     """
     values = medium.scalar if isinstance(medium, ScalarField) else medium.density
-    dtype = torch.float64 if mesh.vertices.device.type in _KNOW_FLOAT64 else mesh.vertices.dtype
+    dtype = backend_for(mesh.vertices).at(None).dtype
     cells, values = mesh.tets.long(), values.to(mesh.vertices.device, dtype)
     corners = mesh.vertices.to(dtype)[cells]
     edges = corners[:, 1:] - corners[:, :1]

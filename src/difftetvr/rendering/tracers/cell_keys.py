@@ -11,6 +11,7 @@ from typing import Any
 import drjit as dr
 
 from difftetvr.backend import Backend
+from difftetvr.mesh.shapes import Vector, cross, dot
 from difftetvr.rendering.search.scene import NONE, Cells
 from difftetvr.rendering.traversal.sums import raise_to
 
@@ -28,8 +29,6 @@ _ROUNDINGS = 8.0
 
 _EXPONENT_AND_FRACTION = 2**63 - 1
 _BOX = 8
-
-Vector = list[Any]
 
 
 @dataclass
@@ -79,7 +78,7 @@ def keys_of(scene: Cells, cells: CellsToSort, extent: Any) -> CellKeys:
     points = [[wide(x) for x in scene.point(corners[k])] for k in range(4)]
     if cells.adjacency is None:
         middle = [a + b + c + d for a, b, c, d in zip(*points, strict=True)]
-        keys, unsettled = _ordered_bits(_dot(middle, middle)), dr.zeros(uint, 1)
+        keys, unsettled = _ordered_bits(dot(middle, middle)), dr.zeros(uint, 1)
         dr.eval(keys, unsettled)
         return CellKeys(keys, [], unsettled)
     largest = wide(0)
@@ -136,10 +135,10 @@ class _Shape:
         """From four corners."""
         origin = points[0]
         a, b, c = ([x - o for x, o in zip(point, origin, strict=True)] for point in points[1:])
-        squares = [_dot(edge, edge) for edge in (a, b, c)]
-        normals = [_cross(b, c), _cross(c, a), _cross(a, b)]
+        squares = [dot(edge, edge) for edge in (a, b, c)]
+        normals = [cross(b, c), cross(c, a), cross(a, b)]
         longest = dr.sqrt(dr.fmax(dr.fmax(squares[0], squares[1]), squares[2]))
-        return _Shape(origin, [a, b, c], squares, normals, _dot(a, normals[0]), longest)
+        return _Shape(origin, [a, b, c], squares, normals, dot(a, normals[0]), longest)
 
 
 def _eye_power(shape: _Shape, rounding: Any) -> Any:
@@ -153,11 +152,11 @@ def _eye_power(shape: _Shape, rounding: Any) -> Any:
         sum(s * n[axis] for s, n in zip(shape.squares, shape.normals, strict=True)) / shape.determinant
         for axis in range(3)
     ]
-    power = _dot(shape.origin, [o + d for o, d in zip(shape.origin, diameter, strict=True)])
+    power = dot(shape.origin, [o + d for o, d in zip(shape.origin, diameter, strict=True)])
     spread = [0.25 * sum(edge[axis] for edge in shape.edges) for axis in range(3)]
     centroid = [o + s for o, s in zip(shape.origin, spread, strict=True)]
-    stand_in = _dot(centroid, centroid) + _dot(spread, spread) - 0.25 * sum(shape.squares)
-    reach = dr.sqrt(_dot(diameter, diameter)) + shape.longest
+    stand_in = dot(centroid, centroid) + dot(spread, spread) - 0.25 * sum(shape.squares)
+    reach = dr.sqrt(dot(diameter, diameter)) + shape.longest
     is_sure = rounding * reach * shape.longest < _SURE * shape.determinant
     return dr.select(is_sure, power, dr.fmin(power, stand_in))
 
@@ -167,9 +166,9 @@ def _eye_is_beyond(shape: _Shape) -> list[Any]:
 
     Cells that rounding turned inside out do not know in from out and say no.
     """
-    beside = [_dot(normal, shape.origin) for normal in shape.normals]
+    beside = [dot(normal, shape.origin) for normal in shape.normals]
     opposite = -(shape.determinant + beside[0] + beside[1] + beside[2])
-    reach = dr.sqrt(_dot(shape.origin, shape.origin)) + shape.longest
+    reach = dr.sqrt(dot(shape.origin, shape.origin)) + shape.longest
     least = _SIGN_CERTAIN * shape.longest * reach * reach
     return [(value > least) & (shape.determinant > 0) for value in (opposite, *beside)]
 
@@ -235,18 +234,10 @@ def dented(creases: Creases) -> Any:
     noise = _ROUNDINGS * dr.fmax(farthest / size * creases.rounding, creases.least_rounding)
     # In units of the mesh, for products of others need not be numbers.
     edges = [[(x - a) / size for x, a in zip(point, points[0], strict=True)] for point in points[1:]]
-    squares = [_dot(edge, edge) for edge in edges]
-    height = _dot(_cross(edges[0], edges[1]), edges[2])
+    squares = [dot(edge, edge) for edge in edges]
+    height = dot(cross(edges[0], edges[1]), edges[2])
     is_flat = height <= noise * dr.fmax(dr.fmax(squares[0], squares[1]), squares[2])
     found = dr.zeros(uint, 1)
     dr.scatter(found, uint(1), uint(0), ~is_flat)
     dr.eval(found)
     return found
-
-
-def _dot(p: Vector, q: Vector) -> Any:
-    return p[0] * q[0] + p[1] * q[1] + p[2] * q[2]
-
-
-def _cross(p: Vector, q: Vector) -> Vector:
-    return [p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0]]
