@@ -6,19 +6,18 @@ and Metal, in float32 and float64. Only kernel modules and the modules that wrap
 
 from __future__ import annotations
 
-import functools
 import importlib
 import os
 import platform
-import sys
 import threading
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache, lru_cache
-from typing import Any, ParamSpec, TypeVar
+from typing import Any
 
+import numpy as np
 import torch
 
 from difftetvr import libcuda, libllvm
@@ -28,9 +27,6 @@ for library in (libllvm, libcuda):
     library.tell_drjit()  # before the first import of Dr.Jit, which looks for them only then
 
 import drjit as dr  # noqa: E402
-
-Parameters = ParamSpec("Parameters")
-Result = TypeVar("Result")
 
 _DEVICE_BACKENDS = {"cpu": "llvm", "cuda": "cuda", "mps": "metal"}
 _TURN = threading.RLock()
@@ -94,7 +90,8 @@ class Backend:
 
     def uints(self, tensor: torch.Tensor) -> Any:
         """Flat Dr.Jit view of an int32 tensor as unsigned integers, likewise: -1 becomes 0xFFFFFFFF."""
-        return self.UInt(self._ready(tensor.detach().to(torch.int32).view(torch.uint32)))
+        ready = self._ready(tensor if tensor.dtype == torch.int32 else tensor.to(torch.int32))
+        return self.UInt(ready.view(np.uint32 if self.name == "llvm" else torch.uint32))
 
     def opaque(self, value: float) -> Any:
         """A scalar as a device value, so that kernels need no recompilation when it changes."""
@@ -176,9 +173,10 @@ class Backend:
 
     def _ready(self, tensor: torch.Tensor) -> Any:
         """A tensor's values as kernels can read them: flat, where packets may begin, and written."""
-        flat = tensor.contiguous().view(-1)
+        flat = tensor.contiguous()
         if self.name == "llvm":
-            return flat.numpy()  # the same memory, handed over in half the time
+            return flat.numpy().reshape(-1)  # the same memory, handed over in half the time
+        flat = flat.view(-1)
         if self.name == "cuda":
             if flat.data_ptr() % _PACKET_BYTES:
                 flat = flat.clone()  # loads of whole packets fault on views that begin in the midst of one
@@ -203,25 +201,6 @@ def _lanes(uint: Any, count: int) -> Any:
 @lru_cache(maxsize=256)
 def _constant(kind: Any, value: float) -> Any:
     return dr.opaque(kind, value)
-
-
-def eager(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """A function that ``torch.compile`` leaves alone and calls, instead of tracing it down to the kernels.
-
-    :func:`torch.compiler.disable` does that, but imports the compiler, which takes longer than most renderings; so it
-    is called once somebody else has.
-    """
-    hidden: list[Callable[Parameters, Result]] = []
-
-    @functools.wraps(function)
-    def call(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
-        if "torch._dynamo" not in sys.modules:
-            return function(*args, **kwargs)
-        if not hidden:
-            hidden.append(torch.compiler.disable(function))
-        return hidden[0](*args, **kwargs)
-
-    return call
 
 
 def backend_for(tensor: torch.Tensor) -> Backend:

@@ -8,15 +8,22 @@ may differ from call to call, and all else is part of the *kind* of the call.
 from __future__ import annotations
 
 import enum
+import functools
 import gc
+import sys
 from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
 from functools import cache, lru_cache
-from typing import Any
+from operator import attrgetter
+from typing import Any, ParamSpec, TypeVar
 
 import drjit as dr
+import torch
 
 from difftetvr.backend import Backend
+
+Parameters = ParamSpec("Parameters")
+Result = TypeVar("Result")
 
 _KINDS = 256  # recordings are small, but each also keeps alive what its kind holds
 _RECORDINGS = 16  # of one kind: Dr.Jit records anew where arrays that had one size have several, or the reverse
@@ -50,6 +57,25 @@ def replayed(function: Callable[..., Any], *arguments: Any) -> Any:
     frozen, call = _frozen(function, kind, dr.thread_count())
     with _no_garbage_collected():
         return frozen(call, arrays)
+
+
+def eager(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """A function that ``torch.compile`` leaves alone and calls, instead of tracing it down to the kernels.
+
+    :func:`torch.compiler.disable` does that, but imports the compiler, which takes longer than most renderings; so it
+    is called once somebody else has.
+    """
+    hidden: list[Callable[Parameters, Result]] = []
+
+    @functools.wraps(function)
+    def call(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
+        if "torch._dynamo" not in sys.modules:
+            return function(*args, **kwargs)
+        if not hidden:
+            hidden.append(torch.compiler.disable(function))
+        return hidden[0](*args, **kwargs)
+
+    return call
 
 
 @contextmanager
@@ -92,29 +118,36 @@ def _frozen(function: Callable[..., Any], kind: Hashable, threads: int) -> tuple
 
 
 def _split(value: Any, arrays: list[Any]) -> Hashable:
-    """A value without its arrays, which are appended to a list."""
+    """A sequence or dataclass without its arrays, which are appended to a list."""
     kind: Any = type(value)
-    names = _contents(kind)
-    if names is None:
-        return value
-    if names is _Array:
-        arrays.append(value)
-        return _Array
-    parts = value if kind in _SEQUENCES else [getattr(value, name) for name in names]
-    return (kind, tuple([_split(part, arrays) for part in parts]))
+    contents = [kind]
+    for part in _parts(kind)(value):
+        # Here, and not in a call for each: there are a hundred of them in a rendering.
+        kind = type(part)
+        parts = _parts(kind)
+        if parts is None:
+            contents.append(part)
+        elif parts is _Array:
+            arrays.append(part)
+            contents.append(_Array)
+        else:
+            contents.append(_split(part, arrays))
+    return tuple(contents)
 
 
 @cache
-def _contents(kind: Any) -> Any:
-    """What to split a value of some type into: attributes, or None for nothing; `_Array` where it is an array."""
+def _parts(kind: Any) -> Any:
+    """What takes a value of some type apart; None where it need not be, `_Array` where it is an array."""
     if issubclass(kind, dr.ArrayBase):
         return _Array
     if issubclass(kind, _STATIC):
         return None
+    if kind in _SEQUENCES:
+        return iter
     names = getattr(kind, "__match_args__", ())  # of dataclasses: what makes one anew
-    if kind not in _SEQUENCES and len(names) != len(getattr(kind, "__dataclass_fields__", (*names, ""))):
+    if len(names) != len(getattr(kind, "__dataclass_fields__", (*names, ""))):
         raise _Unknown
-    return names
+    return attrgetter(*names) if len(names) > 1 else lambda value: [getattr(value, name) for name in names]
 
 
 def _joined(part: Any, arrays: Iterator[Any]) -> Any:
@@ -123,7 +156,7 @@ def _joined(part: Any, arrays: Iterator[Any]) -> Any:
         return next(arrays)
     if not isinstance(part, tuple):
         return part
-    kind, parts = part
+    kind, *parts = part
     values = [_joined(item, arrays) for item in parts]
     return kind(values) if kind in _SEQUENCES else kind(*values)
 

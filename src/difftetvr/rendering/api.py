@@ -9,12 +9,12 @@ from typing import Any, overload
 
 import torch
 
-from difftetvr.backend import eager
 from difftetvr.errors import DiffTetError, shown
 from difftetvr.inputs import as_reals, handed_over
 from difftetvr.memory import tried_twice
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.optics import OpticalModel
+from difftetvr.recording import eager
 from difftetvr.rendering.autograd import RenderFunction
 from difftetvr.rendering.cell_features import CellFeatures
 from difftetvr.rendering.preparation import ViewOptions, as_rays, is_plain, prepare_view
@@ -248,7 +248,7 @@ def _render(
 
         seen = view.viewpoint.with_derivatives_of_rays(image.color, mesh, field, image_of)
         image = replace(image, color=seen)
-    return image.reshaped(*view.shape)
+    return image
 
 
 def as_background(background: Any, like: torch.Tensor, channels: int = 3) -> torch.Tensor | None:

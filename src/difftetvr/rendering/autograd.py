@@ -25,7 +25,7 @@ from difftetvr.rendering.traversal.transfer import KNOT_RECORD
 class RenderFunction(torch.autograd.Function):
     """From vertices, pose, background, limits, rays and content to an image.
 
-    The outputs are (N, C) channels, (N,) opacity, expected distance and optical depth. The inputs that may require
+    The outputs are (..., C) channels, (...) opacity, expected distance and optical depth. The inputs that may require
     gradients are what the tracer was made of, and the (C,) background, which may be None.
     """
 
@@ -41,8 +41,9 @@ class RenderFunction(torch.autograd.Function):
         with backend.exclusive():
             rendered = render_forward(shot.tracer, how)
             image = rendered.image
-            channels = backend.tensor(image.color)[: shot.count * task.channels].view(shot.count, task.channels)
-            pixels = channels, *(backend.tensor(part) for part in (image.alpha, image.depth, image.optical_depth))
+            rest = [backend.tensor(part).view(shot.shape) for part in (image.alpha, image.depth, image.optical_depth)]
+            channels = backend.tensor(image.color)[: task.channels * rest[0].numel()]
+            pixels = channels.view(*shot.shape, task.channels), *rest
         ctx.set_materialize_grads(False)
         ctx.task, ctx.shot, ctx.how, ctx.gathered = task, shot, how, (rendered.light, rendered.distance)
         ctx.flags = flags_here()
@@ -70,7 +71,7 @@ class RenderFunction(torch.autograd.Function):
             geometry, parts = gradient_tensors(task, gradients, pose, vertices)
         by_background = None
         if needs_background and optical_depth is not None and by_image[0] is not None:
-            by_background = (torch.exp(-optical_depth)[:, None] * by_image[0]).sum(0)
+            by_background = (torch.exp(-optical_depth)[..., None] * by_image[0]).view(-1, task.channels).sum(0)
         asked = (part if needed else None for part, needed in zip(parts, ctx.needs_input_grad[7:], strict=True))
         positions = geometry.vertices if needs_vertices else None
         return None, None, positions, geometry.pose, by_background, geometry.limits, geometry.lines, *asked
@@ -82,13 +83,13 @@ class Shot:
 
     Attributes:
         tracer: Finds the crossings.
-        count: Number of rays N.
+        shape: Of the image or bundle (...), of N rays.
         shift: (N,) how far kernels' origins are from the rays' true ones; None where they are these.
         unit: Unit of length of kernels, in world units.
     """
 
     tracer: Tracer
-    count: int
+    shape: tuple[int, ...]
     shift: Any | None
     unit: float
 

@@ -10,11 +10,12 @@ from typing import Any
 import drjit as dr
 import torch
 
-from difftetvr.backend import eager, require_own_threads
+from difftetvr.backend import require_own_threads
 from difftetvr.errors import DiffTetError
 from difftetvr.inputs import require_type
 from difftetvr.memory import tried_twice
 from difftetvr.mesh import Field, TetMesh
+from difftetvr.recording import eager
 from difftetvr.rendering.preparation import ViewOptions, prepare_view
 from difftetvr.rendering.rays import Rays, RaySource
 from difftetvr.rendering.traversal.crossing import Span, Step, Tracer, corner_of, read_vertex

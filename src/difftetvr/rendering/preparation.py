@@ -91,7 +91,7 @@ class PreparedView:
     def shot(self) -> Shot:
         """The view, ready to be rendered."""
         shift = None if self.bundle is None else self.bundle.counted.shift
-        return Shot(self.tracer(self.ends), self.rays.count, shift, self.unit)
+        return Shot(self.tracer(self.ends), self.shape, shift, self.unit)
 
     def empty(self, shape: tuple[int, ...]) -> torch.Tensor:
         """What there is to see of no rays, in the precision of the mesh; autograd knows what it is no part of."""

@@ -71,7 +71,7 @@ class Viewpoint:
     def with_derivatives_of_rays(
         self, color: torch.Tensor, mesh: TetMesh, field: Field, image_of: Callable[[Field], torch.Tensor]
     ) -> torch.Tensor:
-        """An image's (N, 3) colours, now also differentiable in what rays have of their own.
+        """An image's (..., 3) colours, now also differentiable in what rays have of their own.
 
         A colour is linear in those of vertices or cells, so its derivative by the viewpoint is the image of theirs.
 
@@ -91,4 +91,5 @@ class Viewpoint:
             channels = torch.cat(slopes, dim=1).to(field.color.dtype)
             image = image_of(Field(channels, field.density, field.location)).unflatten(-1, (3, 3))
         # Nothing is added but derivatives.
-        return color + ((self.own - self.own.detach()).to(color)[:, None, :] * image).sum(2)
+        nothing = ((self.own - self.own.detach()).to(color)[:, None, :] * image).sum(2)
+        return color + nothing.view(color.shape)

@@ -6,11 +6,11 @@ from typing import Any
 
 import torch
 
-from difftetvr.backend import eager
 from difftetvr.errors import DiffTetError, MeshError, shown
 from difftetvr.inputs import as_reals, require_type
 from difftetvr.memory import tried_twice
 from difftetvr.mesh import Field, TetMesh
+from difftetvr.recording import eager
 from difftetvr.rendering.api import as_background
 from difftetvr.rendering.gauss_newton.models import HatDerivatives, ImageModel, StepDerivatives
 from difftetvr.rendering.kernels.composition import Composition

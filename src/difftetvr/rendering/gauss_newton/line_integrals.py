@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import torch
 
-from difftetvr.backend import eager
 from difftetvr.errors import DiffTetError
 from difftetvr.memory import tried_twice
 from difftetvr.mesh import Field, TetMesh
+from difftetvr.recording import eager
 from difftetvr.rendering.gauss_newton.models import HatDerivatives, ImageModel, StepDerivatives
 from difftetvr.rendering.kernels.hats.absorption import RECORD, IntegralErrors, absorption_records
 from difftetvr.rendering.kernels.hats.kernel import STEP_RECORD, HatSpace

@@ -8,10 +8,10 @@ from typing import Any
 
 import torch
 
-from difftetvr.backend import eager
 from difftetvr.errors import DiffTetError, shown
 from difftetvr.inputs import as_reals
 from difftetvr.mesh import Field, TetMesh
+from difftetvr.recording import eager
 from difftetvr.rendering.api import checked_cameras
 from difftetvr.rendering.cameras.checks import MOST_PIXELS
 from difftetvr.rendering.cell_features import CellFeatures, medium_of

@@ -6,9 +6,10 @@ from collections.abc import Sequence
 
 import torch
 
-from difftetvr.backend import backend_for, eager
+from difftetvr.backend import backend_for
 from difftetvr.errors import MeshError
 from difftetvr.mesh import Field, TetMesh
+from difftetvr.recording import eager
 from difftetvr.rendering.api import RenderedImage, render
 from difftetvr.rendering.cell_features import CellFeatures, medium_of
 from difftetvr.rendering.rays import Rays, RaySource

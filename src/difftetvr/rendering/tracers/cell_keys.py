@@ -89,34 +89,31 @@ def keys_of(scene: Cells, cells: CellsToSort, extent: Any) -> CellKeys:
     behind = dr.gather(backend.UInt4, cells.adjacency, cells.cell)
     predecessors = [dr.select(beyond, behind[k], NONE) for k, beyond in enumerate(_eye_is_beyond(shape))]
     dr.eval(keys, predecessors)
-    return CellKeys(keys, predecessors, _move_behind(backend, keys, predecessors, cells))
+    return CellKeys(*_moved_behind(backend, keys, predecessors, cells.rounds))
 
 
-def _move_behind(backend: Backend, keys: Any, predecessors: list[Any], cells: CellsToSort) -> Any:
-    """Raise keys, in place, by as little as makes each greater than those of all its predecessors; or begin to.
-
-    What that comes to does not depend on the order in which cells are looked at.
+def _moved_behind(backend: Backend, keys: Any, predecessors: list[Any], rounds: int) -> tuple[Any, list[Any], Any]:
+    """Raise keys by as little as makes each greater than those of all its predecessors; or begin to.
 
     Returns:
-        (1,) whether some were raised in the last round.
+        The keys, the predecessors, and (1,) whether some keys were raised in the last round.
     """
     uint, integer = backend.UInt, type(keys)
+    least = integer(-(2**63))
     moved = dr.ones(uint, 1)
     dr.eval(moved)
-    for _ in range(cells.rounds):
-        before, moved = moved, dr.zeros(uint, 1)
-        is_on = dr.gather(uint, before, uint(0)) != 0
-        last = integer(-(2**63))
+    for _ in range(rounds):
+        is_on, moved = dr.gather(uint, moved, uint(0)) != 0, dr.zeros(uint, 1)
+        last = least
         for neighbor in predecessors:
             there = is_on & (neighbor != NONE)
             key = dr.gather(integer, keys, neighbor, there)
             last = dr.select(there & (key > last), key, last)
-        own = dr.gather(integer, keys, cells.cell, is_on)
-        is_late = is_on & (last >= own) & (last > integer(-(2**63)))
-        dr.scatter(keys, last + 1, cells.cell, is_late)
+        is_late = (last >= keys) & (last > least)
         dr.scatter(moved, uint(1), uint(0), is_late)
+        keys = dr.select(is_late, last + 1, keys)
         dr.eval(keys, moved)
-    return moved
+    return keys, predecessors, moved
 
 
 @dataclass

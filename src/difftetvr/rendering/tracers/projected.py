@@ -96,7 +96,8 @@ class Projected:
         uint, width = self.view.backend.UInt, self.scene.image.width
         row = rays.pixel // width
         tile = (row >> TILE_BITS) * self.columns + ((rays.pixel - row * width) >> TILE_BITS)
-        end = dr.gather(uint, lists.end, tile, rays.valid)
+        # A ray without a tile has an empty list: gathers give 0 where they are masked.
+        begin, end = (dr.gather(uint, lists.bounds, tile + k, rays.valid) for k in range(2))
 
         def cross(index: Any, ray: Any) -> tuple[Any, Any]:
             cell = dr.gather(uint, lists.cells, index)
@@ -107,7 +108,5 @@ class Projected:
 
             return index + 1, dr.if_stmt((ray,), is_hit, hit, lambda ray: ray)
 
-        # A ray without a tile's list has an empty one: gathers give 0 where they are masked.
-        state = (dr.gather(uint, lists.begin, tile, rays.valid), ray)
         more = lambda index, ray: (index < end) & kernel.goes_on(ray)  # noqa: E731
-        return dr.while_loop(state, more, cross)[1]
+        return dr.while_loop((begin, ray), more, cross)[1]

@@ -23,12 +23,11 @@ class TileLists:
     """Cells that may be seen through each tile, front to back.
 
     Attributes:
-        begin, end: (tiles,) part of ``cells`` that belongs to each tile, row by row.
+        bounds: (tiles + 1,) where in ``cells`` those of each tile begin, row by row, and where the last ones end.
         cells: Cell indices.
     """
 
-    begin: Any
-    end: Any
+    bounds: Any
     cells: Any
 
 
@@ -79,12 +78,11 @@ class Tiler:
             pairs: How many pairs of cell and tile there are; None where nobody knows.
             budget: Pairs of cell and tile to hold at a time; a single cell may have more.
         """
-        self.backend, (width, height) = scene.backend, scene.image.size
+        self.backend, self.tiles, (width, height) = scene.backend, tiles, scene.image.size
         self.columns = _tiles(width)
         self.count = self.columns * _tiles(height)
         self.cells = order.to(torch.int32)
-        rows = (self.backend.tensor(part) for part in (tiles.pairs, tiles.width, tiles.first))
-        self.pairs, self.width, self.first = (row.index_select(0, order) for row in rows)
+        self.pairs = self.backend.tensor(tiles.pairs).index_select(0, order)
         is_one = pairs is not None and pairs <= budget
         bands = [Band(0, len(order), pairs or 0)] if is_one else bands_of(self.pairs.long(), budget)
         self.parts = [band for band in bands if band.total]
@@ -95,45 +93,35 @@ class Tiler:
 
     def _lists(self, part: Band) -> TileLists:
         backend, cells = self.backend, slice(part.first, part.last)
-        pairs = self.pairs[cells]
-        source = _Rectangles(
-            backend,
-            backend.uints(pairs),
-            backend.uints(self.width[cells]),
-            backend.uints(self.first[cells]),
-            backend.uints(pairs.cumsum(0) - pairs),
-            backend.uints(self.cells[cells]),
-            backend.constant(self.columns),
-        )
+        ends = self.pairs[cells].cumsum(0, dtype=torch.int32)
+        columns = backend.constant(self.columns)
+        source = _CellsInOrder(backend, backend.uints(self.cells[cells]), backend.uints(ends), self.tiles, columns)
         found = replayed(_pairs_of, source, few_lengths(part.total))
         tiles, owners = (backend.tensor(row)[: part.total] for row in found)
         # Stable: within a tile, cells stay in their order.
         tiles, permutation = torch.sort(tiles, stable=True)
-        bounds = torch.searchsorted(tiles, torch.arange(self.count + 1, device=tiles.device, dtype=tiles.dtype))
-        bounds = bounds.to(torch.int32)
-        lists = TileLists(*(backend.uints(row) for row in (bounds[:-1], bounds[1:], owners[permutation])))
-        backend.run(lists)
-        return lists
+        numbers = torch.arange(self.count + 1, device=tiles.device, dtype=tiles.dtype)
+        bounds = torch.searchsorted(tiles, numbers, out_int32=True)
+        return TileLists(backend.uints(bounds), backend.uints(owners.index_select(0, permutation)))
 
 
 @dataclass
-class _Rectangles:
-    """The tiles of some cells, see :class:`CellTiles`; where their pairs begin among all, and the cells' numbers."""
+class _CellsInOrder:
+    """Some cells, front to back; where the pairs of each end among those of all; and the tiles of any cell."""
 
     backend: Backend
-    pairs: Any
-    width: Any
-    first: Any
-    begin: Any
     cell: Any
+    end: Any
+    tiles: CellTiles
     columns: Any
 
 
-def _pairs_of(source: _Rectangles, length: int) -> tuple[Any, Any]:
+def _pairs_of(source: _CellsInOrder, length: int) -> tuple[Any, Any]:
     """(length,) tiles and (length,) cells of all pairs, cell by cell; for :func:`difftetvr.recording.replayed`."""
-    integer, uint = source.backend.Int, source.backend.UInt
+    integer, uint, cell, of_cell = source.backend.Int, source.backend.UInt, source.cell, source.tiles
     tiles, cells = dr.empty(integer, length), dr.empty(integer, length)
-    pairs, width, begin, cell = (uint(part) for part in (source.pairs, source.width, source.begin, source.cell))
+    pairs, width, first = (uint(dr.gather(integer, row, cell)) for row in (of_cell.pairs, of_cell.width, of_cell.first))
+    begin = source.end - pairs
 
     def write(place: Any, column: Any, tile: Any) -> tuple[Any, Any, Any]:
         dr.scatter(tiles, integer(tile), begin + place)
@@ -143,8 +131,7 @@ def _pairs_of(source: _Rectangles, length: int) -> tuple[Any, Any]:
         step = dr.select(is_last, source.columns - width + 1, uint(1))
         return place + 1, dr.select(is_last, uint(0), column + 1), tile + step
 
-    state = (uint(0), uint(0), uint(source.first))
-    dr.while_loop(state, lambda place, column, tile: place < pairs, write)
+    dr.while_loop((uint(0), uint(0), first), lambda place, column, tile: place < pairs, write)
     dr.eval(tiles, cells)
     return tiles, cells
 
