@@ -85,7 +85,7 @@ class Backend:
 
         Compute what depends on the view with :meth:`run` before the tensor may go away.
         """
-        tensor = tensor.detach()
+        tensor = tensor.detach() if tensor.requires_grad else tensor
         return self.Float(self._ready(tensor if tensor.dtype == self.dtype else tensor.to(self.dtype)))
 
     def uints(self, tensor: torch.Tensor) -> Any:
@@ -176,7 +176,7 @@ class Backend:
         flat = tensor.contiguous()
         if self.name == "llvm":
             return flat.numpy().reshape(-1)  # the same memory, handed over in half the time
-        flat = flat.view(-1)
+        flat = flat if flat.dim() == 1 else flat.view(-1)
         if self.name == "cuda":
             if flat.data_ptr() % _PACKET_BYTES:
                 flat = flat.clone()  # loads of whole packets fault on views that begin in the midst of one

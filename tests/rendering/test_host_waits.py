@@ -43,3 +43,18 @@ def test_a_rendering_and_its_backward_pass_wait_once(name: str) -> None:
     copied = {"PyTorch: numbers to the device": 1, "PyTorch: bytes to the device": 64}
     copied |= {"Dr.Jit: numbers to the device": 1, "Dr.Jit: bytes to the device": 24}
     assert copies_of(call) == copied | {"Dr.Jit: numbers to the host": 1, "Dr.Jit: bytes to the host": 64}
+
+
+def test_an_idle_device_tells_the_host_again_what_it_told_it() -> None:
+    if "cuda_emulation.started" not in sys.modules:
+        pytest.skip("a GPU does not know how to be idle")
+    from cuda_emulation.host_times import Operations, host_time
+    from cuda_emulation.host_waits import calls, waits_of
+
+    call = calls()["bundle of rays, image"]
+    launches, _ = waits_of(call)
+    before = call().color.cpu()
+    with Operations() as counted:
+        _, operations, kernels = host_time(call, counted, repetitions=3)
+    assert kernels == launches and operations > 0
+    assert (call().color.cpu() == before).all()  # at work again

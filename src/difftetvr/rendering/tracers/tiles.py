@@ -82,9 +82,9 @@ class Tiler:
         self.columns = _tiles(width)
         self.count = self.columns * _tiles(height)
         self.cells = order.to(torch.int32)
-        self.pairs = self.backend.tensor(tiles.pairs).index_select(0, order)
-        is_one = pairs is not None and pairs <= budget
-        bands = [Band(0, len(order), pairs or 0)] if is_one else bands_of(self.pairs.long(), budget)
+        bands = [Band(0, len(order), pairs or 0)]
+        if pairs is None or pairs > budget:
+            bands = bands_of(self.backend.tensor(tiles.pairs).index_select(0, order).long(), budget)
         self.parts = [band for band in bands if band.total]
 
     def lists(self) -> Iterator[TileLists]:
@@ -92,10 +92,9 @@ class Tiler:
         return (self._lists(part) for part in self.parts)
 
     def _lists(self, part: Band) -> TileLists:
-        backend, cells = self.backend, slice(part.first, part.last)
-        ends = self.pairs[cells].cumsum(0, dtype=torch.int32)
-        columns = backend.constant(self.columns)
-        source = _CellsInOrder(backend, backend.uints(self.cells[cells]), backend.uints(ends), self.tiles, columns)
+        backend = self.backend
+        cells = backend.uints(self.cells[part.first : part.last])
+        source = _CellsInOrder(backend, cells, self.tiles, backend.constant(self.columns))
         found = replayed(_pairs_of, source, few_lengths(part.total))
         tiles, owners = (backend.tensor(row)[: part.total] for row in found)
         # Stable: within a tile, cells stay in their order.
@@ -107,11 +106,10 @@ class Tiler:
 
 @dataclass
 class _CellsInOrder:
-    """Some cells, front to back; where the pairs of each end among those of all; and the tiles of any cell."""
+    """Some cells, front to back, and the tiles of any."""
 
     backend: Backend
     cell: Any
-    end: Any
     tiles: CellTiles
     columns: Any
 
@@ -121,7 +119,7 @@ def _pairs_of(source: _CellsInOrder, length: int) -> tuple[Any, Any]:
     integer, uint, cell, of_cell = source.backend.Int, source.backend.UInt, source.cell, source.tiles
     tiles, cells = dr.empty(integer, length), dr.empty(integer, length)
     pairs, width, first = (uint(dr.gather(integer, row, cell)) for row in (of_cell.pairs, of_cell.width, of_cell.first))
-    begin = source.end - pairs
+    begin = dr.prefix_sum(pairs)
 
     def write(place: Any, column: Any, tile: Any) -> tuple[Any, Any, Any]:
         dr.scatter(tiles, integer(tile), begin + place)
