@@ -60,7 +60,7 @@ def test_rate_falls_log_linearly():
 
 
 def test_pace_lengthens_the_steps_of_vertices():
-    usual = FitConfig(iterations=100)
+    usual = FitConfig(iterations=100, pace=1.0)
     faster = dataclasses.replace(usual, pace=8.0)
     for iteration in (0, 40, 94):
         assert faster.motion_rate_at(iteration) == pytest.approx(8.0 * usual.motion_rate_at(iteration))

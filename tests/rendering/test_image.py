@@ -182,6 +182,17 @@ def test_background_shows_through() -> None:
     torch.testing.assert_close(image.depth, black.depth, rtol=0, atol=0)
 
 
+def test_the_backgrounds_derivative_takes_an_image_in_any_layout() -> None:
+    scene = SCENES["delaunay"]()
+    leaves = leaves_of(scene, torch.float32)
+    leaves["background"] = torch.tensor([0.3, 0.5, 0.7], requires_grad=True)
+    image = render_leaves(scene, leaves)
+    weights = torch.rand(3, *image.alpha.shape, generator=torch.Generator().manual_seed(0))
+    (image.color.permute(2, 0, 1) * weights).sum().backward()  # as of losses that take channels first
+    expected = ((1.0 - image.alpha) * weights).sum((1, 2))
+    torch.testing.assert_close(leaves["background"].grad, expected, rtol=1e-5, atol=1e-5)
+
+
 def test_expected_depth_of_a_thin_volume() -> None:
     """Expected depth does not depend on the scale of the densities while next to nothing is absorbed."""
     scene = SCENES["jittered"]()

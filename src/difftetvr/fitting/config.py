@@ -42,7 +42,6 @@ _STARTS = ("grid", "hull", "points")
 _DEFAULT_CELLS, _DEFAULT_ITERATIONS = 20_000, 2400
 _PHOTO_BANDS, _PHOTO_ITERATIONS = 2, 4800
 _CUT_OUT_DENSITY_RATE = 5.0  # what stands before a background would be put where it is seen first, and stay
-_PHOTO_PACE = 8.0
 _PHOTO_PIXELS_PER_CELL = 12
 _FREE_BEFORE_POINTS, _FREE_BEFORE_BOUNDS = 0.8, 0.5
 _MOST_PHOTO_CELLS = 1_000_000
@@ -54,7 +53,6 @@ _CHOICES_FOR_VOLUMES: dict[str, Any] = {
     "background": "black",
     "harmonics": 0,
     "density_rate": 1.0,
-    "pace": 1.0,
     "free_space": 0.0,
 }
 CHOSEN_FOR_CAPTURE = tuple(_CHOICES_FOR_VOLUMES)
@@ -91,9 +89,9 @@ class FitConfig(Schedule):
     """Mend an initial mesh that has flat cells or repeated vertices or cells; without it such a mesh is refused."""
     move: bool = True
     """Whether vertices move."""
-    pace: float | None = None
-    """Length of the vertices' steps, in units of that of --motion.rate and its schedule; default: 8 for photographs,
-    whose surfaces are far from where the mesh begins, else 1."""
+    pace: float = 8.0
+    """Length of the vertices' steps, in units of that of --motion.rate and its schedule. With 8, most are as long as
+    --motion.cap lets them, but in the end, or where gradients disagree."""
     refine: Refine = "exchange"
     """How the mesh refines itself: exchange cells at their full number, grow from a coarse mesh, subdivide stars as in
     the article, or not at all."""
@@ -238,7 +236,6 @@ class FitConfig(Schedule):
             "background": "random" if capture.is_cut_out else "black",
             "harmonics": _PHOTO_BANDS,
             "density_rate": _CUT_OUT_DENSITY_RATE if capture.is_cut_out else 1.0,
-            "pace": _PHOTO_PACE,
             "free_space": free_space if capture.surroundings > 1.0 else 0.0,
         }
 
@@ -258,7 +255,7 @@ class FitConfig(Schedule):
     def motion_rate_at(self, iteration: int) -> float | None:
         """Length of the vertices' steps, in altitudes; None where they stay."""
         rate = super().motion_rate_at(iteration)
-        return None if rate is None else (self.pace or 1.0) * rate
+        return None if rate is None else self.pace * rate
 
     def background_at(self, iteration: int) -> tuple[float, float, float]:
         """Linear RGB background of a step; like the views a function of seed and iteration alone."""

@@ -71,7 +71,7 @@ class RenderFunction(torch.autograd.Function):
             geometry, parts = gradient_tensors(task, gradients, pose, vertices)
         by_background = None
         if needs_background and optical_depth is not None and by_image[0] is not None:
-            by_background = (torch.exp(-optical_depth)[..., None] * by_image[0]).view(-1, task.channels).sum(0)
+            by_background = (torch.exp(-optical_depth)[..., None] * by_image[0]).reshape(-1, task.channels).sum(0)
         asked = (part if needed else None for part, needed in zip(parts, ctx.needs_input_grad[7:], strict=True))
         positions = geometry.vertices if needs_vertices else None
         return None, None, positions, geometry.pose, by_background, geometry.limits, geometry.lines, *asked

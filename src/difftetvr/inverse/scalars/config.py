@@ -82,7 +82,7 @@ class ScalarConfig(Schedule):
     """Iterations between glances at a few held-out views, for the curves only; 0: never."""
     checkpoint_seconds: float = 30.0
     """Seconds between checkpoints."""
-    motion: Motion = field(default_factory=Motion)
+    motion: Motion = field(default_factory=lambda: Motion(barrier=0.03))
     """How vertices move."""
     exchange: Exchange = field(default_factory=lambda: Exchange(start=_START))
     """Options of --refine exchange."""

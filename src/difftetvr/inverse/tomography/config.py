@@ -105,7 +105,7 @@ class TomographyConfig(Schedule):
     """Iterations between glances at a few held-out views, for the curves only; 0: never."""
     checkpoint_seconds: float = 60.0
     """Seconds between checkpoints."""
-    motion: Motion = field(default_factory=lambda: Motion(rate=0.8, final_rate=0.04))
+    motion: Motion = field(default_factory=lambda: Motion(rate=0.8, final_rate=0.04, barrier=0.03))
     """How vertices move."""
     exchange: Exchange = field(default_factory=lambda: Exchange(start=_START))
     """Options of --refine exchange."""
