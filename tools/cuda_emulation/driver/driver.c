@@ -45,6 +45,8 @@ static void give_up(const char *what, const char *of) {
     abort();
 }
 
+#include "told.h"
+
 /* ---- Counts of what a host pays for ---------------------------------------------------------------------------- */
 
 enum {
@@ -211,32 +213,6 @@ static int is_of_host(const void *pointer, int waits) {
         if ((const char *) pointer >= begin && (const char *) pointer < begin + block->bytes) return block->is_host;
     }
     return waits;
-}
-
-/* What a host is told. An idle device computes nothing and tells again what was heard of it, so that only the host's work
- * takes time. */
-enum { AT_WORK, HEARD, IDLE };
-static int state;
-static struct { uint8_t *bytes; size_t length, next; } told;
-
-EXPORT void emulated_cuda_set_state(int now) {
-    if (now == HEARD) told.length = 0;
-    told.next = 0;
-    state = now;
-}
-
-static void tell(void *target, const void *source, size_t bytes) {
-    if (state == HEARD) {
-        told.bytes = realloc(told.bytes, told.length + bytes);
-        memcpy(told.bytes + told.length, source, bytes);
-        told.length += bytes;
-    }
-    if (state == IDLE) {
-        if (told.next + bytes > told.length) give_up("an idle device is asked for more than", "it was asked at work");
-        source = told.bytes + told.next;
-        told.next += bytes;
-    }
-    memmove(target, source, bytes);
 }
 
 static int count_copy(const void *target, const void *source, size_t bytes, int waits) {
