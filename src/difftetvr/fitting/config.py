@@ -90,8 +90,8 @@ class FitConfig(Schedule):
     move: bool = True
     """Whether vertices move."""
     pace: float = 8.0
-    """Length of the vertices' steps, in units of that of --motion.rate and its schedule. With 8, most are as long as
-    --motion.cap lets them, but in the end, or where gradients disagree."""
+    """Length of the vertices' steps, in units of that of --motion.rate and its schedule. Gradients of single views
+    agree so little that few steps come to that length."""
     refine: Refine = "exchange"
     """How the mesh refines itself: exchange cells at their full number, grow from a coarse mesh, subdivide stars as in
     the article, or not at all."""
