@@ -46,16 +46,16 @@ def shiny() -> dtv.Capture:
 
 def test_what_is_left_open_is_chosen_for_the_images(shiny: dtv.Capture) -> None:
     chosen = dtv.FitConfig().for_capture(shiny)
-    assert (chosen.background, chosen.harmonics, chosen.density_rate) == ("random", 2, 5.0)
+    assert (chosen.background, chosen.harmonics, chosen.density_rate, chosen.pace) == ("random", 2, 5.0, 8.0)
     assert chosen.evaluation_background() == (1.0, 1.0, 1.0)
     opaque = dataclasses.replace(shiny, alphas=None)
     of_opaque = dtv.FitConfig().for_capture(opaque)
-    assert (of_opaque.background, of_opaque.density_rate) == ("black", 1.0)
+    assert (of_opaque.background, of_opaque.density_rate, of_opaque.pace) == ("black", 1.0, 8.0)
     light = dataclasses.replace(shiny, encoding="linear")
     of_light = dtv.FitConfig().for_capture(light)
-    assert (light.encoding, of_light.harmonics, of_light.density_rate) == ("linear", 0, 1.0)
+    assert (light.encoding, of_light.harmonics, of_light.density_rate, of_light.pace) == ("linear", 0, 1.0, 8.0)
     options = {"background": "white", "harmonics": 0, "cells": 500, "start": "grid", "iterations": 9}
-    given = dtv.FitConfig(**options, free_space=0.1, density_rate=2.0)
+    given = dtv.FitConfig(**options, free_space=0.1, density_rate=2.0, pace=3.0)
     assert given.for_capture(shiny) == given
     assert dtv.FitConfig.from_json(chosen.to_json()) == chosen
 

@@ -67,7 +67,6 @@ class Motion(VertexOptimizerConfig):
 
     barrier: float = 0.01
     """Weight of the shape barrier, the sum of -log Q over all cells, in units of the rate; 0: none."""
-
     boundary: Literal["fixed", "slide"] = "slide"
     """Whether vertices on the boundary stay, or slide in their plane or along their crease."""
     every: int = 2

@@ -89,14 +89,15 @@ def keys_of(scene: Cells, cells: CellsToSort, extent: Any) -> CellKeys:
     behind = dr.gather(backend.UInt4, cells.adjacency, cells.cell)
     predecessors = [dr.select(beyond, behind[k], NONE) for k, beyond in enumerate(_eye_is_beyond(shape))]
     dr.eval(keys, predecessors)
-    return CellKeys(*_moved_behind(backend, keys, predecessors, cells.rounds))
+    keys, unsettled = _moved_behind(backend, keys, predecessors, cells.rounds)
+    return CellKeys(keys, predecessors, unsettled)
 
 
-def _moved_behind(backend: Backend, keys: Any, predecessors: list[Any], rounds: int) -> tuple[Any, list[Any], Any]:
+def _moved_behind(backend: Backend, keys: Any, predecessors: list[Any], rounds: int) -> tuple[Any, Any]:
     """Raise keys by as little as makes each greater than those of all its predecessors; or begin to.
 
     Returns:
-        The keys, the predecessors, and (1,) whether some keys were raised in the last round.
+        The keys, and (1,) whether some keys were raised in the last round.
     """
     uint, integer = backend.UInt, type(keys)
     least = integer(-(2**63))
@@ -113,7 +114,7 @@ def _moved_behind(backend: Backend, keys: Any, predecessors: list[Any], rounds: 
         dr.scatter(moved, uint(1), uint(0), is_late)
         keys = dr.select(is_late, last + 1, keys)
         dr.eval(keys, moved)
-    return keys, predecessors, moved
+    return keys, moved
 
 
 @dataclass
