@@ -19,7 +19,7 @@ from difftetvr.rendering.cell_features import CellFeatures
 from difftetvr.rendering.clip_plane import clip_limits
 from difftetvr.rendering.kernels.layout import LARGEST
 from difftetvr.rendering.prepared_rays import GivenBundle, PreparedRays
-from difftetvr.rendering.rays import Rays, RaySource, image_order
+from difftetvr.rendering.rays import Rays, RaySource
 from difftetvr.rendering.scalar_field import ScalarField
 from difftetvr.rendering.task import TRACERS, Content, RenderTask
 from difftetvr.rendering.traversal.crossing import Tracer
@@ -135,7 +135,6 @@ def prepare_view(
             raise MeshError(
                 f"The field is on '{tensor.device}', the mesh on '{mesh.vertices.device}'; move one of them."
             )
-    order: torch.Tensor | None = None
     passed: _Passed
     if isinstance(source, Camera):
         shape: tuple[int, ...] = (source.height, source.width)
@@ -144,14 +143,12 @@ def prepare_view(
         passed = _Passed(mesh.vertices, pose, parts, 1.0, None, clip)
     else:
         shape = tuple(source.shape)
-        order = image_order(shape, mesh.vertices.device)
         passed = _Passed(mesh.vertices, None, parts, 1.0, GivenBundle.of(source, mesh, clip_plane), None)
     has_features = isinstance(field, CellFeatures) and content != "cell"
     task = RenderTask(
         backend_for(mesh.vertices),
         mesh,
         source if isinstance(source, Camera) else None,
-        order,
         options.optics or (ConstantPerCell() if content == "cell" else ExactLinear()),
         content,
         3 if content == "scalar" and not has_features else parts[0].shape[1],

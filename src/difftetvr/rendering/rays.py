@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, Protocol, runtime_checkable
@@ -40,7 +41,7 @@ class Rays:
             as_reals(getattr(self, name), f"The rays' {name}", CameraError, advice="pass a tensor of shape (..., 3)")
             for name in ("origins", "directions")
         )
-        near, far = (_end(name, getattr(self, name), directions) for name in ("near", "far"))
+        ends = [_end(name, getattr(self, name), directions) for name in ("near", "far")]
         for name, tensor in (("origins", origins), ("directions", directions)):
             if tensor.shape[-1:] != (3,):
                 raise CameraError(f"The rays' {name} have shape {tuple(tensor.shape)}; pass (..., 3).")
@@ -50,9 +51,11 @@ class Rays:
             )
         try:
             origins, directions = torch.broadcast_tensors(origins, directions)
-            near, far = (torch.broadcast_to(end, origins.shape[:-1]) for end in (near, far))
+            near, far = (
+                torch.broadcast_to(end, origins.shape[:-1]) if isinstance(end, torch.Tensor) else end for end in ends
+            )
         except RuntimeError as reason:
-            shapes = ", ".join(str(tuple(tensor.shape)) for tensor in (origins, directions, near, far))
+            shapes = ", ".join(str(tuple(getattr(part, "shape", ()))) for part in (origins, directions, *ends))
             raise CameraError(
                 f"The rays' origins, directions, near and far have shapes {shapes}, which do not fit together; pass "
                 "(..., 3), (..., 3), (...) and (...)."
@@ -88,8 +91,10 @@ class Rays:
     @property
     def ends(self) -> tuple[torch.Tensor, torch.Tensor]:
         """``near`` and ``far`` as (...) tensors."""
-        near, far = self.near, self.far
-        assert isinstance(near, torch.Tensor) and isinstance(far, torch.Tensor)
+        near, far = (
+            end if isinstance(end, torch.Tensor) else self.directions.new_full((), end).expand(self.shape)
+            for end in (self.near, self.far)
+        )
         return near, far
 
     @property
@@ -125,10 +130,13 @@ class Rays:
         counts = [int(group.max()) + 1 if group.numel() else 0 for group in groups]
         are_parallel = counts[1] < counts[0]
         group, count = groups[are_parallel], counts[are_parallel]
-        near, far = (end.reshape(-1) for end in self.ends)
         all_places = torch.split(torch.argsort(group, stable=True), torch.bincount(group, minlength=count).tolist())
-        parts = [(place, Rays(origins[place], directions[place], near[place], far[place])) for place in all_places]
-        return parts, are_parallel
+
+        def part(place: torch.Tensor) -> Rays:
+            ends = (e.reshape(-1)[place] if isinstance(e, torch.Tensor) else e for e in (self.near, self.far))
+            return Rays(origins[place], directions[place], *ends)
+
+        return [(place, part(place)) for place in all_places], are_parallel
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Rays:
         """The same rays on another device or in another precision; autograd sees them as a function of these.
@@ -136,8 +144,8 @@ class Rays:
         Raises:
             CameraError: This machine has no such device.
         """
-        tensors = (self._starts, self.directions, *self.ends)
-        return Rays(*(moved(tensor, device, dtype, CameraError) for tensor in tensors))
+        parts: tuple[Any, ...] = (self._starts, self.directions, self.near, self.far)
+        return Rays(*(moved(x, device, dtype, CameraError) if isinstance(x, torch.Tensor) else x for x in parts))
 
     def at(self, distances: torch.Tensor | float) -> torch.Tensor:
         """(..., 3) points at distances along the rays; differentiable.
@@ -176,16 +184,26 @@ class Rays:
             raise CameraError(
                 f"Bundles of rays are stacked if they have one shape, but {told}; join them, or pass some."
             )
-        vectors = [(bundle.origins, bundle.directions, *bundle.ends) for bundle in bundles]
-        return Rays(*(torch.stack(part) for part in zip(*vectors, strict=True)))
+        origins, directions = (torch.stack([getattr(b, name) for b in bundles]) for name in ("origins", "directions"))
+        return Rays(origins, directions, *_shared_ends(bundles, torch.stack))
 
     @staticmethod
     def joined(bundles: Sequence[Rays]) -> Rays:
         """The rays of several bundles one after the other, (N,)."""
-        parts = [
-            (b.origins.reshape(-1, 3), b.directions.reshape(-1, 3), *(e.reshape(-1) for e in b.ends)) for b in bundles
-        ]
-        return Rays(*(torch.cat(part) for part in zip(*parts, strict=True)))
+        origins, directions = (
+            torch.cat([getattr(b, name).reshape(-1, 3) for b in bundles]) for name in ("origins", "directions")
+        )
+        return Rays(origins, directions, *_shared_ends(bundles, lambda ends: torch.cat([e.reshape(-1) for e in ends])))
+
+
+def _shared_ends(
+    bundles: Sequence[Rays], join: Callable[[list[torch.Tensor]], torch.Tensor]
+) -> Iterator[torch.Tensor | float]:
+    """``near`` and ``far`` of several bundles in one: a number where it is that of all of them."""
+    for place, name in enumerate(("near", "far")):
+        first, *rest = (getattr(bundle, name) for bundle in bundles)
+        is_number = isinstance(first, float) and all(isinstance(end, float) and end == first for end in rest)
+        yield first if is_number else join([bundle.ends[place] for bundle in bundles])
 
 
 def one_vector(vectors: torch.Tensor) -> torch.Tensor | None:
@@ -221,10 +239,11 @@ class RaySource(Protocol):
         ...
 
 
-def _end(name: str, value: Any, directions: torch.Tensor) -> torch.Tensor:
-    """Where rays begin or end, on their device."""
-    if type(value) is float:
-        return directions.new_full((), value)
+def _end(name: str, value: Any, directions: torch.Tensor) -> torch.Tensor | float:
+    """Where rays begin or end, on their device; a number stays one, which kernels need not read for each ray."""
+    if type(value) in (float, int):
+        with suppress(OverflowError):  # is refused below
+            return float(value)
     end = as_reals(value, f"The rays' {name}", CameraError, directions.dtype, "pass a number or tensor")
     return end.to(directions.device)
 

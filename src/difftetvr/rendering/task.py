@@ -44,7 +44,6 @@ class RenderTask:
         backend: Where kernels run.
         mesh: The mesh, for its topology.
         camera: The camera whose rays are traced; None for a bundle of rays.
-        order: (N,) int32 number of the ray that each lane of a bundle has; None for rays as they are numbered.
         optics: Optical model of one cell.
         content: What the volume holds.
         channels: Number of channels C that are seen.
@@ -57,7 +56,6 @@ class RenderTask:
     backend: Backend
     mesh: TetMesh
     camera: Camera | None
-    order: torch.Tensor | None
     optics: OpticalModel
     content: Content
     channels: int
@@ -104,7 +102,7 @@ class RenderTask:
     def rays(self, bundle: PreparedRays | None) -> KernelRays:
         """The rays: those of a bundle, or of the camera."""
         if bundle is not None:
-            return BundleRays.of(self.backend, bundle.counted.lines, self.order)
+            return BundleRays.of(self.backend, bundle.counted.lines, bundle.order)
         assert self.camera is not None
         return self.camera.kernel_rays(self.backend)
 
@@ -144,7 +142,7 @@ class RenderTask:
             laid_out.cells,
             self.content == "cell",
             Transfer.of(backend, parts[-2], parts[-1]) if self.content == "scalar" else None,
-            backend.opaque(self.threshold),
+            backend.constant(float(self.threshold)),
             ends,
             backend.lanes(rays.lane_count),
         )

@@ -38,7 +38,7 @@ class PinholeRays:
     def of(backend: Backend, camera: Camera) -> PinholeRays:
         """Upload a camera's intrinsics."""
         values = [camera.fx, camera.fy, camera.cx, camera.cy, 1.0 / camera.fx, 1.0 / camera.fy]
-        width, height = (backend.opaque_uint(pixels) for pixels in (camera.width, camera.height))
+        width, height = (backend.constant(pixels) for pixels in (camera.width, camera.height))
         return PinholeRays((camera.width, camera.height), backend.Float(values), width, height)
 
     def _intrinsic(self, place: int) -> Any:

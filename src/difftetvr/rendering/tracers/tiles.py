@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import drjit as dr
@@ -93,14 +94,14 @@ class Tiler:
 
     def _lists(self, part: Band) -> TileLists:
         backend = self.backend
-        cells = backend.uints(self.cells[part.first : part.last])
+        is_whole = part.last - part.first == len(self.cells)
+        cells = backend.uints(self.cells if is_whole else self.cells[part.first : part.last])
         source = _CellsInOrder(backend, cells, self.tiles, backend.constant(self.columns))
         found = replayed(_pairs_of, source, few_lengths(part.total))
         tiles, owners = (backend.tensor(row)[: part.total] for row in found)
         # Stable: within a tile, cells stay in their order.
         tiles, permutation = torch.sort(tiles, stable=True)
-        numbers = torch.arange(self.count + 1, device=tiles.device, dtype=tiles.dtype)
-        bounds = torch.searchsorted(tiles, numbers, out_int32=True)
+        bounds = torch.searchsorted(tiles, _numbers(self.count + 1, tiles.device), out_int32=True)
         return TileLists(backend.uints(bounds), backend.uints(owners.index_select(0, permutation)))
 
 
@@ -132,6 +133,12 @@ def _pairs_of(source: _CellsInOrder, length: int) -> tuple[Any, Any]:
     dr.while_loop((uint(0), uint(0), first), lambda place, column, tile: place < pairs, write)
     dr.eval(tiles, cells)
     return tiles, cells
+
+
+@lru_cache(maxsize=16)
+def _numbers(count: int, device: torch.device) -> torch.Tensor:
+    """(count,) int32 numbers from 0, which are shared and must not be changed."""
+    return torch.arange(count, dtype=torch.int32, device=device)
 
 
 def _tiles(pixels: Any) -> Any:

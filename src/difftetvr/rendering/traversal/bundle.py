@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
-import torch
 
 from difftetvr.backend import Backend
 from difftetvr.rendering.traversal.rays import Frame, Lanes
@@ -31,11 +30,10 @@ class BundleRays:
     count: int
 
     @staticmethod
-    def of(backend: Backend, lines: Any, order: torch.Tensor | None) -> BundleRays:
-        """Take flat (N, 6) origins and unit directions, and (N,) int32 numbers of the lanes' rays."""
+    def of(backend: Backend, lines: Any, order: Any | None) -> BundleRays:
+        """Take flat (N, 6) origins and unit directions, and (N,) numbers of the lanes' rays."""
         count = dr.width(lines) // 6
-        lanes = None if order is None else backend.uints(order)
-        return BundleRays(backend, lines, lanes, backend.opaque_uint(count), count)
+        return BundleRays(backend, lines, order, backend.constant(count), count)
 
     @property
     def lane_count(self) -> int:
