@@ -93,14 +93,14 @@ class Projected:
         kernel.finish(ray)
 
     def _composite(self, kernel: Kernel, rays: Lanes, lists: TileLists, ray: Any) -> Any:
-        uint, width = self.view.backend.UInt, self.scene.image.width
+        integer, uint, width = self.view.backend.Int, self.view.backend.UInt, self.scene.image.width
         row = rays.pixel // width
         tile = (row >> TILE_BITS) * self.columns + ((rays.pixel - row * width) >> TILE_BITS)
         # A ray without a tile has an empty list: gathers give 0 where they are masked.
-        begin, end = (dr.gather(uint, lists.bounds, tile + k, rays.valid) for k in range(2))
+        begin, end = (uint(dr.gather(integer, lists.bounds, tile + k, rays.valid)) for k in range(2))
 
         def cross(index: Any, ray: Any) -> tuple[Any, Any]:
-            cell = dr.gather(uint, lists.cells, index)
+            cell = uint(dr.gather(integer, lists.cells, index))
             is_hit, half_face = self.scene.entered(rays.frame, cell)
 
             def hit(ray: Any) -> Any:

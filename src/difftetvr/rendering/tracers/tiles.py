@@ -24,8 +24,9 @@ class TileLists:
     """Cells that may be seen through each tile, front to back.
 
     Attributes:
-        bounds: (tiles + 1,) where in ``cells`` those of each tile begin, row by row, and where the last ones end.
-        cells: Cell indices.
+        bounds: (tiles + 1,) signed, where in ``cells`` those of each tile begin, row by row, and where the last ones
+            end.
+        cells: Cell indices, signed.
     """
 
     bounds: Any
@@ -95,14 +96,14 @@ class Tiler:
     def _lists(self, part: Band) -> TileLists:
         backend = self.backend
         is_whole = part.last - part.first == len(self.cells)
-        cells = backend.uints(self.cells if is_whole else self.cells[part.first : part.last])
+        cells = backend.ints(self.cells if is_whole else self.cells[part.first : part.last])
         source = _CellsInOrder(backend, cells, self.tiles, backend.constant(self.columns))
         found = replayed(_pairs_of, source, few_lengths(part.total))
         tiles, owners = (backend.tensor(row)[: part.total] for row in found)
         # Stable: within a tile, cells stay in their order.
         tiles, permutation = torch.sort(tiles, stable=True)
         bounds = torch.searchsorted(tiles, _numbers(self.count + 1, tiles.device), out_int32=True)
-        return TileLists(backend.uints(bounds), backend.uints(owners.index_select(0, permutation)))
+        return TileLists(backend.ints(bounds), backend.ints(owners.index_select(0, permutation)))
 
 
 @dataclass
@@ -117,8 +118,9 @@ class _CellsInOrder:
 
 def _pairs_of(source: _CellsInOrder, length: int) -> tuple[Any, Any]:
     """(length,) tiles and (length,) cells of all pairs, cell by cell; for :func:`difftetvr.recording.replayed`."""
-    integer, uint, cell, of_cell = source.backend.Int, source.backend.UInt, source.cell, source.tiles
+    integer, uint, of_cell = source.backend.Int, source.backend.UInt, source.tiles
     tiles, cells = dr.empty(integer, length), dr.empty(integer, length)
+    cell = uint(source.cell)
     pairs, width, first = (uint(dr.gather(integer, row, cell)) for row in (of_cell.pairs, of_cell.width, of_cell.first))
     begin = dr.prefix_sum(pairs)
 
