@@ -238,21 +238,36 @@ def test_a_run_that_is_resumed_ends_as_if_it_had_not_stopped(tmp_path) -> None:
 
 
 def test_the_axis_is_found_where_it_is() -> None:
-    """A scan whose axis is off by more than a pixel, described as if it were not."""
+    """A scan whose axis is off by more than a pixel and tilted, described as if it were not."""
     mesh = TetMesh.grid((6, 6, 6), (-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
-    for geometry in (PARALLEL, CONE):
+    for geometry in (PARALLEL | {"axis_offset": 0.3}, CONE | {"axis_offset": -0.2}):
         true = ProjectionGeometry.from_dict(geometry)
+        as_told = Measurements(scan_of(mesh, ball(mesh), geometry), torch.device("cpu"))
+        assert as_told.axis_shift() == pytest.approx(0.0, abs=0.1)
         moved = Alignment("axis", true.shape, torch.device("cpu"))
         with torch.no_grad():
-            moved.shift[0] = 1.5
+            moved.shift[0], moved.tilt[()] = 1.5, math.radians(2.0)
             views = [integrals(mesh, ball(mesh), moved.applied(true.view(k), k)).float() for k in range(24)]
         test = torch.arange(24) % 6 == 2
         capture = ProjectionCapture(true, torch.stack(views), None, None, test)
-        options = small(iterations=150, align="axis", move=False, refine="none", cells=1300)
+        options = small(iterations=300, align="axis", move=False, refine="none", cells=1300)
         found = reconstruct(capture, options)
         unaware = reconstruct(capture, dataclasses.replace(options, align="none"))
-        assert found.alignment.to_json()["axis_shift_pixels"] == pytest.approx(1.5, abs=0.5)
-        assert found.score.mean_psnr > unaware.score.mean_psnr
+        told = found.alignment.to_json()
+        assert told["axis_shift_pixels"] == pytest.approx(1.5, abs=0.1)
+        assert told["axis_tilt_degrees"] == pytest.approx(2.0, abs=0.3)
+        assert found.score.mean_psnr > unaware.score.mean_psnr + 5.0
+
+
+def test_few_rows_tell_the_place_of_the_axis_but_no_tilt() -> None:
+    mesh = TetMesh.grid((8, 8, 1), (-1.0, -1.0, -0.05), (1.0, 1.0, 0.05))
+    geometry = PARALLEL | {"detector": [40, 2], "detector_size": [3, 0.1], "volume_size": [2, 2, 0.1]}
+    geometry |= {"axis_offset": 0.3}
+    scan = scan_of(mesh, ball(mesh.with_vertices(mesh.vertices * torch.tensor([1.0, 1.0, 0.0]))), geometry)
+    centered = ProjectionGeometry.from_dict(geometry | {"axis_offset": 0.0})
+    found = reconstruct(dataclasses.replace(scan, geometry=centered), small(iterations=300, align="axis"))
+    told = found.alignment.to_json()
+    assert abs(told["axis_shift_pixels"]) == pytest.approx(4.0, abs=0.2) and told["axis_tilt_degrees"] == 0.0
 
 
 def test_pixels_that_do_not_count_say_nothing() -> None:

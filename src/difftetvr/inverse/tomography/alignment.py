@@ -18,6 +18,8 @@ from difftetvr.rendering.cameras.detector import Detector
 
 _BETAS = (0.9, 0.99)
 _TILT_PER_PIXEL = 2.0  # a step of the tilt moves the ends of a row by about as much as one of the shift moves all
+_LEAST_HEIGHT = 0.125
+"""Of a detector of which a tilt is learned, in widths: the ends of few rows would leave all that is reconstructed."""
 
 
 class Alignment:
@@ -25,7 +27,7 @@ class Alignment:
 
     Attributes:
         shift: (2,) shift of all views along rows and columns of pixels, in pixels; the second one stays 0.
-        tilt: () rotation of all detectors in their plane, in radians.
+        tilt: () rotation of all detectors in their plane, in radians; 0 where they have few rows beside their columns.
         of_views: (V, 2) shifts of single views besides, in pixels; none for views that are held out.
     """
 
@@ -38,7 +40,7 @@ class Alignment:
             device: Where densities are.
             shift: Where the axis is taken to be, in pixels.
         """
-        views, _, width = size
+        views, height, width = size
         self.shift = torch.tensor([shift, 0.0], dtype=torch.float64, device=device)
         self.tilt = torch.zeros((), dtype=torch.float64, device=device)
         self.of_views = torch.zeros(views, 2, dtype=torch.float64, device=device)
@@ -46,7 +48,8 @@ class Alignment:
         self._leaves = [self.shift, self.tilt, self.of_views][:count]
         for leaf in self._leaves:
             leaf.requires_grad_()
-        self._rates = [1.0, _TILT_PER_PIXEL / width, 1.0][:count]
+        tilting = _TILT_PER_PIXEL / width if height >= _LEAST_HEIGHT * width else 0.0
+        self._rates = [1.0, tilting, 1.0][:count]
         self._optimizer = CarriedAdam([[leaf] for leaf in self._leaves], _BETAS) if self._leaves else None
 
     @property

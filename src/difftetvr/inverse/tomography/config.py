@@ -87,9 +87,9 @@ class TomographyConfig(Schedule):
     refine: Refine = "exchange"
     """How the mesh refines itself: exchange cells at their full number, grow from a coarse mesh, or not at all."""
     align: Refined = "none"
-    """Corrections of the geometry that are learned along: the place and tilt of the axis, the same in all views (axis),
-    or each view's shift besides (views)."""
-    align_rate: float = 0.5
+    """Corrections of the geometry that are learned along: the place of the axis and, with an eighth as many rows as
+    columns or more, its tilt, the same in all views (axis), or each view's shift besides (views)."""
+    align_rate: float = 0.1
     """Their rate in the first step, in pixels; it falls as that of densities does."""
     solve_steps: int = 10
     """Steps of conjugate gradients after the last iteration, for densities alone; 0: none."""

@@ -106,7 +106,7 @@ class Measurements:
         return PixelSet(detector, measured, weight)
 
     def axis_shift(self) -> float:
-        """Pixels by which the detector has to move along its rows so that the axis is where its views turn around.
+        """Pixels by which the detector has to move along its rows so that the axis, z, is where its views turn around.
 
         The centre of what a parallel view absorbs swings around the axis as a sine of the angle (the first moment of
         Helgason and Ludwig's conditions), and nearly so that of a cone beam. 0 where angles are not known, or are fewer
@@ -120,7 +120,7 @@ class Measurements:
         seen = torch.where(self._weight[views] > 0, self._measured[views], 0.0).clamp(min=0.0).double().sum(1).cpu()
         place = torch.arange(width, dtype=torch.float64) + 0.5 - 0.5 * width
         mass = seen.sum(1)
-        centers = (seen * place).sum(1) / mass.clamp(min=_LEAST)
+        centers = (seen * place).sum(1) / mass.clamp(min=_LEAST) - axis_places(self.capture.geometry.detector)[views]
         turns = torch.deg2rad(angles[views])
         sines = torch.stack((torch.ones_like(turns), torch.cos(turns), torch.sin(turns)), 1)
         fitted = torch.linalg.lstsq(sines, centers[:, None]).solution[0, 0]
@@ -223,6 +223,21 @@ def as_camera(detector: Detector) -> Camera | None:
     cx = 0.5 * detector.width - float(to_center @ right) / float(across)
     cy = 0.5 * detector.height - float(to_center @ below) / float(down)
     return Camera(pose, fx, fy, cx, cy, detector.width, detector.height)
+
+
+def axis_places(detector: Detector) -> torch.Tensor:
+    """(B,) float64 pixels from the middle of a detector along its rows at which each view sees the z axis."""
+    center, columns, rows = (
+        part.double().cpu().reshape(-1, 3) for part in (detector.center, detector.columns, detector.rows)
+    )
+    on_axis = center * torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    if detector.source is not None:
+        along = on_axis - detector.source.double().cpu()
+    else:
+        assert detector.direction is not None
+        along = detector.direction.double().cpu().reshape(-1, 3)
+    center, columns, rows, on_axis, along = torch.broadcast_tensors(center, columns, rows, on_axis, along)
+    return torch.linalg.solve(torch.stack((columns, rows, along), dim=2), on_axis - center)[:, 0]
 
 
 def box_is_before_detector(geometry: ProjectionGeometry) -> bool:
