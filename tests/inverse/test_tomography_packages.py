@@ -16,7 +16,7 @@ QUIET = lambda line: None  # noqa: E731
 @pytest.fixture
 def peers(monkeypatch):
     monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks" / "peers"))
-    names = ("projector", "scan", "variation", "iterations", "fdk", "voxels", "slices", "packages")
+    names = ("projector", "scan", "variation", "iterations", "fdk", "voxels", "slices", "packages", "axis")
     yield __import__("tomography_packages")
     for name in names:
         sys.modules.pop(f"tomography_{name}", None)
@@ -114,3 +114,38 @@ def test_missing_packages_are_named(peers, monkeypatch):
     monkeypatch.setitem(sys.modules, "skimage.transform", None)
     with pytest.raises(CaptureError, match="pip install scikit-image"):
         peers.package("skimage.transform", "scikit-image")
+
+
+def off_axis_scan() -> tuple[ProjectionCapture, torch.Tensor, float]:
+    """Two rows of a body that no turn and no mirror brings onto itself, the axis in pixels from the left edge."""
+    values = body()[:, :, [8, 16]]
+    pitch = 2 / SIZE
+    geometry = {"type": "parallel", "views": 60, "arc": 180, "volume_size": [2, 2, 2 * pitch]}
+    geometry |= {"detector": [WIDTH, 2], "detector_size": [WIDTH * pitch, 2 * pitch]}
+    parsed = ProjectionGeometry.from_dict(geometry | {"axis_offset": -3 * pitch})
+    exact = project_volume(values, parsed, device="cpu")
+    capture = ProjectionCapture(parsed, exact, None, None, ProjectionCapture.held_out(10, 60), "blobs")
+    return capture, values, 0.5 * WIDTH + 3
+
+
+def test_slices_about_an_axis_are_where_views_see_them(peers) -> None:
+    axis = __import__("tomography_axis")
+    capture, values, place = off_axis_scan()
+    scan = axis.CenteredRows.of(capture, place)
+    edge = (WIDTH - SIZE) // 2
+    padded = torch.nn.functional.pad(values, (0, 0, edge, edge, edge, edge)).permute(2, 0, 1).flip(0)
+    true = padded.double().numpy() * (2 / SIZE)
+    assert scan.held_out_psnr(true) > 80.0
+    assert (
+        max(scan.held_out_psnr(true[::-1]), scan.held_out_psnr(true[:, ::-1]), scan.held_out_psnr(true[..., ::-1])) < 30
+    )
+
+
+def test_back_projection_about_an_axis_sees_the_scan_where_it_is(peers) -> None:
+    pytest.importorskip("skimage")
+    axis = __import__("tomography_axis")
+    capture, _, place = off_axis_scan()
+    right, wrong = (axis.CenteredRows.of(capture, place + shift) for shift in (0.0, 1.0))
+    assert right.held_out_psnr(axis.back_projected(right, "ramp")) > 30.0
+    assert right.held_out_psnr(axis.back_projected(wrong, "ramp")) < 30.0
+    assert right.held_out_psnr(axis.sart(right, 2)) > 30.0
