@@ -267,7 +267,7 @@ def test_few_rows_tell_the_place_of_the_axis_but_no_tilt() -> None:
     centered = ProjectionGeometry.from_dict(geometry | {"axis_offset": 0.0})
     found = reconstruct(dataclasses.replace(scan, geometry=centered), small(iterations=300, align="axis"))
     told = found.alignment.to_json()
-    assert abs(told["axis_shift_pixels"]) == pytest.approx(4.0, abs=0.2) and told["axis_tilt_degrees"] == 0.0
+    assert abs(told["axis_shift_pixels"]) == pytest.approx(4.0, abs=0.2) and "axis_tilt_degrees" not in told
 
 
 def test_pixels_that_do_not_count_say_nothing() -> None:

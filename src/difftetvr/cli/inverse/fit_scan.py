@@ -205,8 +205,9 @@ def _outcome(result: TomographyResult, compared: dict[str, Any], folder: RunFold
     if compared:
         lines.append(f"Against the truth: PSNR {compared['volume_psnr']:.2f} dB at the voxels' centres")
     if result.alignment.is_learned:
-        shift, tilt = result.alignment.to_json().values()
-        lines.append(f"Axis: seen {shift:+.2f} pixels beside where it was said to be, tilted by {tilt:+.3f} degrees")
+        found = result.alignment.to_json()
+        tilt = f", tilted by {found['axis_tilt_degrees']:+.3f} degrees" if "axis_tilt_degrees" in found else ""
+        lines.append(f"Axis: seen {found['axis_shift_pixels']:+.2f} pixels beside where it was said to be{tilt}")
     lines += [
         f"{counted(metrics['cells'], 'cell')}, {counted(metrics['iterations'], 'iteration')} in "
         f"{metrics['seconds']:.1f} s",

@@ -48,14 +48,14 @@ class ScalarConfig(Schedule):
     scalars are found but for a change that rises, or falls, all along, which a function can undo."""
     cells: int = 20_000
     """Budget of tetrahedra: the run begins with about as many, and refinement ends within it."""
-    iterations: int = 2400
+    iterations: int = 1800
     """Number of optimisation steps."""
     colors_first: int | None = None
     """Iterations before these, in which colours and densities are fitted, to which scalars are found that look like
-    them; 0: begin with the same scalar everywhere. Default: a quarter of --iterations."""
+    them; 0: begin with the same scalar everywhere. Default: two thirds of --iterations."""
     batch_views: int = 1
     """Training views per step."""
-    rate: float = 0.03
+    rate: float = 0.015
     """Learning rate of scalars in the first step."""
     final_rate: float = 0.001
     """Learning rate in the last step; in between it falls log-linearly."""
@@ -82,7 +82,7 @@ class ScalarConfig(Schedule):
     """Iterations between glances at a few held-out views, for the curves only; 0: never."""
     checkpoint_seconds: float = 30.0
     """Seconds between checkpoints."""
-    motion: Motion = field(default_factory=lambda: Motion(barrier=0.03))
+    motion: Motion = field(default_factory=lambda: Motion(rate=0.8, final_rate=0.08))
     """How vertices move."""
     exchange: Exchange = field(default_factory=lambda: Exchange(start=_START))
     """Options of --refine exchange."""
@@ -115,7 +115,7 @@ class ScalarConfig(Schedule):
     @property
     def color_steps(self) -> int:
         """Iterations in which colours and densities are fitted first."""
-        return self.iterations // 4 if self.colors_first is None else self.colors_first
+        return 2 * self.iterations // 3 if self.colors_first is None else self.colors_first
 
     def strategy(self) -> Strategy | None:
         """How the mesh is refined, in rounds between which scalars can settle; None if it is not."""

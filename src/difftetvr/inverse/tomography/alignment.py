@@ -48,8 +48,8 @@ class Alignment:
         self._leaves = [self.shift, self.tilt, self.of_views][:count]
         for leaf in self._leaves:
             leaf.requires_grad_()
-        tilting = _TILT_PER_PIXEL / width if height >= _LEAST_HEIGHT * width else 0.0
-        self._rates = [1.0, tilting, 1.0][:count]
+        self._learns_tilt = height >= _LEAST_HEIGHT * width
+        self._rates = [1.0, _TILT_PER_PIXEL / width if self._learns_tilt else 0.0, 1.0][:count]
         self._optimizer = CarriedAdam([[leaf] for leaf in self._leaves], _BETAS) if self._leaves else None
 
     @property
@@ -76,13 +76,13 @@ class Alignment:
         return dataclasses.replace(detector, center=center, columns=columns, rows=rows)
 
     def to_json(self) -> dict[str, float]:
-        """What holds for all views, as JSON values; nothing where nothing is corrected."""
+        """What holds for all views, as JSON values; without what is not learned."""
         if not self.is_learned:
             return {}
-        return {
-            "axis_shift_pixels": float(self.shift[0].detach()),
-            "axis_tilt_degrees": math.degrees(float(self.tilt.detach())),
-        }
+        found = {"axis_shift_pixels": float(self.shift[0].detach())}
+        if self._learns_tilt:
+            found["axis_tilt_degrees"] = math.degrees(float(self.tilt.detach()))
+        return found
 
     def zero_grad(self) -> None:
         """Forgets the gradients."""

@@ -237,7 +237,9 @@ def axis_places(detector: Detector) -> torch.Tensor:
         assert detector.direction is not None
         along = detector.direction.double().cpu().reshape(-1, 3)
     center, columns, rows, on_axis, along = torch.broadcast_tensors(center, columns, rows, on_axis, along)
-    return torch.linalg.solve(torch.stack((columns, rows, along), dim=2), on_axis - center)[:, 0]
+    # Detectors whose vectors lie in a plane see no point of the axis: the pseudoinverse says something of them, too.
+    solved = torch.linalg.pinv(torch.stack((columns, rows, along), dim=2)) @ (on_axis - center)[..., None]
+    return solved[:, 0, 0]
 
 
 def box_is_before_detector(geometry: ProjectionGeometry) -> bool:
