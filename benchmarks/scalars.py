@@ -46,7 +46,7 @@ class Table:
     def __init__(self, seen: dtv.Capture, unseen: dtv.Capture) -> None:
         self.seen, self.unseen = seen, unseen
         self.views = seen.test_indices.tolist()
-        view = self.views[0]
+        self.view = view = self.views[len(self.views) // 2]
         self.panels = [[("truth", seen.images[view])], [("truth, unseen function", unseen.images[view])]]
         print("| | cells | held out, dB | through the unseen function, dB | s |\n|---|---|---|---|---|", flush=True)
 
@@ -60,7 +60,7 @@ class Table:
         }
         for k, shown in fields.items():
             with torch.no_grad():
-                image = dtv.render(mesh, shown, self.seen.cameras[self.views[0]]).color
+                image = dtv.render(mesh, shown, self.seen.cameras[self.view]).color
             self.panels[k].append((name, image))
         cells = f"{mesh.num_cells:,}".replace(",", " ")
         told = [f"{psnr[k]:.2f}" if k in psnr else "" for k in (0, 1)]
@@ -82,7 +82,7 @@ def main() -> None:
     start = time.perf_counter()
     colors = dtv.fit(seen, dtv.FitConfig(cells=options.cells, iterations=options.iterations, evaluate_every=0))
     table.add("colours and densities", colors.mesh, colors.field, time.perf_counter() - start)
-    first = options.iterations // 5
+    first = 2 * options.iterations // 5
     for name, colors_first in (("scalars, from colours and densities", first), ("scalars, from one everywhere", 0)):
         config = ScalarConfig(
             cells=options.cells,
