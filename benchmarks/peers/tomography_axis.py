@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import math
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -22,7 +21,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image
-from tomography_packages import package
+from tomography_packages import PackageSart, best_pass, package
 
 from difftetvr.capture import ProjectionCapture, project_volume
 from difftetvr.errors import DiffTetError
@@ -33,7 +32,7 @@ from difftetvr.view.pictures import below, beside, labelled, save_picture, to_pi
 
 HOLDOUT_EVERY = 10
 WINDOWS = ("ramp", "hann")
-RELAXATION = 0.15
+SHOWN = 340  # pixels of a slice, from its middle
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,14 +68,18 @@ class CenteredRows:
         """N."""
         return self.sinograms.shape[2]
 
+    @property
+    def pitch(self) -> float:
+        """Side of a pixel of the detector and of the slices."""
+        return float(self.capture.geometry.detector.columns.reshape(-1, 3)[0].norm())
+
     def held_out_psnr(self, slices: np.ndarray) -> float:
         """Mean PSNR in dB of the held-out views by (rows, N, N) slices, the first one on top."""
         capture, rows = self.capture, len(slices)
-        pitch = float(capture.geometry.detector.columns.reshape(-1, 3)[0].norm())
-        half = 0.5 * pitch * torch.tensor([self.size, self.size, rows], dtype=torch.float64)
+        half = 0.5 * self.pitch * torch.tensor([self.size, self.size, rows], dtype=torch.float64)
         test = capture.test_indices
         geometry = dataclasses.replace(capture.geometry.select(test), bounds=torch.stack((-half, half)))
-        values = torch.from_numpy(slices[::-1].copy()).permute(1, 2, 0).float() / pitch
+        values = torch.from_numpy(slices[::-1].copy()).permute(1, 2, 0).float() / self.pitch
         errors = (project_volume(values, geometry) - capture.line_integrals[test]).double().square().flatten(1).mean(1)
         peak = float(capture.line_integrals.max())
         return sum(psnr_of_mse(float(error) / peak**2) for error in errors) / len(test)
@@ -89,27 +92,14 @@ def back_projected(scan: CenteredRows, window: str) -> np.ndarray:
     return np.array(slices)
 
 
-def sart(scan: CenteredRows, passes: int) -> np.ndarray:
+def sart(scan: CenteredRows, options: PackageSart) -> np.ndarray:
     """(rows, N, N) by SART, at least 0, of the pass that predicts held-out views best."""
-    update = package("skimage.transform", "scikit-image").iradon_sart
-    slices = np.zeros((len(scan.sinograms), scan.size, scan.size))
-    best, best_psnr = slices.copy(), -math.inf
-    for _ in range(passes):
-        for image, sinogram in zip(slices, scan.sinograms, strict=True):
-            image[:] = update(
-                np.ascontiguousarray(sinogram.T), scan.degrees, image, clip=(0.0, math.inf), relaxation=RELAXATION
-            )
-        psnr = scan.held_out_psnr(slices)
-        if psnr < best_psnr:
-            break
-        best, best_psnr = slices.copy(), psnr
-    return best
+    return best_pass(scan.sinograms, scan.degrees, options, lambda slices, _: scan.held_out_psnr(slices))
 
 
 def sliced(result: TomographyResult, scan: CenteredRows) -> np.ndarray:
     """(N, N) of the mesh in the middle of the first row, at the middles of the pixels of the others."""
-    pitch = float(scan.capture.geometry.detector.columns.reshape(-1, 3)[0].norm())
-    first = -pitch * (scan.size // 2)
+    pitch, first = scan.pitch, -scan.pitch * (scan.size // 2)
     height = 0.5 * pitch * (len(scan.sinograms) - 1)
     lattice = (first, first, height), (pitch, pitch, pitch), (scan.size, scan.size, 1)
     values = voxelise(result.mesh, result.field.density, *lattice)
@@ -117,29 +107,18 @@ def sliced(result: TomographyResult, scan: CenteredRows) -> np.ndarray:
 
 
 def picture(images: dict[str, np.ndarray]) -> Image.Image:
-    """Slices beside one another, and, below, a part of each three times as large."""
+    """The middles of slices beside one another and, below, a third of each, enlarged."""
     top = max(float(np.quantile(image, 0.999)) for image in images.values())
 
-    def row(names: list[str], cut: Callable[[np.ndarray], np.ndarray], scale: int) -> Image.Image:
+    def row(width: int, labels: list[str]) -> Image.Image:
         panels = []
-        for name, label in zip(images, names, strict=True):
-            gray = torch.from_numpy(np.ascontiguousarray(cut(images[name]) / top)).float().clamp(0.0, 1.0)
-            shown = to_picture(gray[..., None].expand(*gray.shape, 3) ** 2.2)
-            panels.append(labelled(shown.resize((scale * shown.width, scale * shown.height), Image.NEAREST), label))
+        for image, label in zip(images.values(), labels, strict=True):
+            first = max(0, (len(image) - width) // 2)
+            part = torch.from_numpy(image[first : first + width, first : first + width].copy() / top)
+            panels.append(labelled(to_picture(part[..., None].expand(-1, -1, 3)), label))
         return beside(panels)
 
-    return below([row(list(images), _object, 1), row([" "] * len(images), _detail, 3)])
-
-
-def _object(image: np.ndarray) -> np.ndarray:
-    """The middle of a slice, 340 pixels wide at most."""
-    first = max(0, (len(image) - 340) // 2)
-    return image[first : first + 340, first : first + 340]
-
-
-def _detail(image: np.ndarray) -> np.ndarray:
-    """A third of that, from its middle."""
-    return _object(image)[120:233, 120:233]
+    return below([row(SHOWN, list(images)), row(SHOWN // 3, [""] * len(images))])
 
 
 def rows_of(path: Path, options: argparse.Namespace) -> Iterator[tuple[str, str, float, float, np.ndarray]]:
@@ -152,10 +131,11 @@ def rows_of(path: Path, options: argparse.Namespace) -> Iterator[tuple[str, str,
     axis = 0.5 * given.geometry.shape[2] - found.alignment.to_json()["axis_shift_pixels"]
     print(f"The axis was found {axis:.2f} pixels from the left edge.\n")
     scan = CenteredRows.of(ProjectionCapture.load(path, HOLDOUT_EVERY, center=axis), axis)
+    by_sart = PackageSart(passes=options.passes)
     numbers = scan.sinograms.shape[0] * scan.size**2
     methods: list[tuple[str, Callable[[], np.ndarray]]] = [
         *((f"FBP, {window} window", lambda window=window: back_projected(scan, window)) for window in WINDOWS),
-        (f"SART, relaxation {RELAXATION:g}", lambda: sart(scan, options.passes)),
+        (f"SART, relaxation {by_sart.relaxation:g}", lambda: sart(scan, by_sart)),
     ]
     for name, make in methods:
         start = time.perf_counter()

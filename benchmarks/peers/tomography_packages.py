@@ -84,27 +84,40 @@ def package(module: str, name: str) -> ModuleType:
 
 def sart(scan: VoxelScan, options: PackageSart, watch: Callable[[str], None]) -> torch.Tensor:
     """(N^3) densities by scikit-image, at least 0."""
-    update = package("skimage.transform", "scikit-image").iradon_sart
     slices = Slices.of(scan)
     slices.require_middle_pixel()
     projector = VoxelProjector(scan.geometry, slices.size)
-    images = np.zeros((slices.size, slices.width, slices.width), np.float32)
-    best, best_psnr = slices.volume(images), -math.inf
+
+    def judge(images: np.ndarray, step: int) -> float:
+        psnr = scan.held_out_psnr(slices.volume(images), projector)
+        watch(f"scikit-image, relaxation {options.relaxation:g}, pass {step}: held-out views {psnr:.3f} dB")
+        return psnr
+
+    return slices.volume(best_pass(slices.sinograms, slices.degrees.astype(np.float32), options, judge))
+
+
+def best_pass(
+    sinograms: np.ndarray, degrees: np.ndarray, options: PackageSart, judge: Callable[[np.ndarray, int], float]
+) -> np.ndarray:
+    """Slices by scikit-image's SART, at least 0, of the last pass before one that is judged worse.
+
+    Args:
+        sinograms: (slices, views, N), the middle of whose columns sees the axis; N is odd.
+        degrees: (views,) in the same precision, which is that of the slices.
+        options: Relaxation and number of passes.
+        judge: Takes (slices, N, N) and the number of passes that made them.
+    """
+    update = package("skimage.transform", "scikit-image").iradon_sart
+    images = np.zeros((len(sinograms), sinograms.shape[2], sinograms.shape[2]), sinograms.dtype)
+    best, best_score = images.copy(), -math.inf
     for step in range(options.passes):
-        for image, sinogram in zip(images, slices.sinograms, strict=True):
-            image[:] = update(
-                np.ascontiguousarray(sinogram.T),
-                slices.degrees.astype(np.float32),
-                image,
-                clip=(0.0, math.inf),
-                relaxation=options.relaxation,
-            )
-        volume = slices.volume(images)
-        psnr = scan.held_out_psnr(volume, projector)
-        watch(f"scikit-image, relaxation {options.relaxation:g}, pass {step + 1}: held-out views {psnr:.3f} dB")
-        if psnr < best_psnr:
+        for image, sinogram in zip(images, sinograms, strict=True):
+            turned = np.ascontiguousarray(sinogram.T)
+            image[:] = update(turned, degrees, image, clip=(0.0, math.inf), relaxation=options.relaxation)
+        score = judge(images, step + 1)
+        if score < best_score:
             break
-        best, best_psnr = volume, psnr
+        best, best_score = images.copy(), score
     return best
 
 

@@ -148,4 +148,4 @@ def test_back_projection_about_an_axis_sees_the_scan_where_it_is(peers) -> None:
     right, wrong = (axis.CenteredRows.of(capture, place + shift) for shift in (0.0, 1.0))
     assert right.held_out_psnr(axis.back_projected(right, "ramp")) > 30.0
     assert right.held_out_psnr(axis.back_projected(wrong, "ramp")) < 30.0
-    assert right.held_out_psnr(axis.sart(right, 2)) > 30.0
+    assert right.held_out_psnr(axis.sart(right, peers.PackageSart(passes=2))) > 30.0

@@ -44,13 +44,11 @@ class Alignment:
         self.shift = torch.tensor([shift, 0.0], dtype=torch.float64, device=device)
         self.tilt = torch.zeros((), dtype=torch.float64, device=device)
         self.of_views = torch.zeros(views, 2, dtype=torch.float64, device=device)
-        count = {"none": 0, "axis": 2, "views": 3}[kind]
-        self._leaves = [self.shift, self.tilt, self.of_views][:count]
-        for leaf in self._leaves:
-            leaf.requires_grad_()
-        self._learns_tilt = height >= _LEAST_HEIGHT * width
-        self._rates = [1.0, _TILT_PER_PIXEL / width if self._learns_tilt else 0.0, 1.0][:count]
-        self._optimizer = CarriedAdam([[leaf] for leaf in self._leaves], _BETAS) if self._leaves else None
+        tilt = ["tilt"] if height >= _LEAST_HEIGHT * width else []
+        learned = {"none": [], "axis": ["shift", *tilt], "views": ["shift", *tilt, "of_views"]}[kind]
+        self._leaves: dict[str, torch.Tensor] = {name: getattr(self, name).requires_grad_() for name in learned}
+        self._rates = [_TILT_PER_PIXEL / width if name == "tilt" else 1.0 for name in learned]
+        self._optimizer = CarriedAdam([[leaf] for leaf in self._leaves.values()], _BETAS) if learned else None
 
     @property
     def is_learned(self) -> bool:
@@ -80,7 +78,7 @@ class Alignment:
         if not self.is_learned:
             return {}
         found = {"axis_shift_pixels": float(self.shift[0].detach())}
-        if self._learns_tilt:
+        if "tilt" in self._leaves:
             found["axis_tilt_degrees"] = math.degrees(float(self.tilt.detach()))
         return found
 
@@ -105,9 +103,8 @@ class Alignment:
         """Corrections and optimiser state by name."""
         if self._optimizer is None:
             return {}
-        names = ("shift", "tilt", "of_views")
         tensors = {}
-        for name, leaf in zip(names, self._leaves, strict=False):
+        for name, leaf in self._leaves.items():
             tensors[f"alignment.{name}"] = leaf
             for key, value in self._optimizer.state(leaf).items():
                 tensors[f"alignment.{name}.{key}"] = value
