@@ -9,7 +9,7 @@ import torch
 
 from difftetvr.errors import MeshError
 from difftetvr.mesh import Field, TetMesh
-from difftetvr.mesh.harmonics import COUNTS, harmonic_basis
+from difftetvr.mesh.harmonics import COUNTS, harmonic_basis, seen_colors
 from difftetvr.mesh.io import load, load_data, save
 
 
@@ -67,6 +67,35 @@ def test_a_field_seen_from_a_point(location):
     assert field.seen_from(mesh, eye).harmonics is None
     plain = Field(field.color, field.density, location)
     assert plain.seen_from(mesh, eye) is plain
+
+
+@pytest.mark.parametrize("vectors", [1, 12])
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_derivatives_of_seen_colours(degree, vectors):
+    generator = torch.Generator().manual_seed(degree)
+    color, harmonics, along = (
+        torch.randn(shape, generator=generator, dtype=torch.float64).requires_grad_()
+        for shape in ((12, 3), (12, COUNTS[degree], 3), (vectors, 3))
+    )
+    seen = seen_colors(color, harmonics, along)
+    assert (seen == 0).any() and (seen > 0).any()
+    assert torch.autograd.gradcheck(seen_colors, (color, harmonics, along))
+
+
+def test_a_colour_at_0_can_rise_and_one_below_cannot():
+    color = torch.tensor([[0.0, -1.0, 1.0]], requires_grad=True)
+    seen_colors(color, torch.zeros(1, 3, 3), torch.ones(1, 3)).sum().backward()
+    assert color.grad.tolist() == [[1.0, 0.0, 1.0]]
+
+
+def test_seen_colours_that_are_not_numbers_none_at_all_and_no_direction():
+    color = torch.tensor([[torch.nan, 0.5, 0.5]])
+    assert seen_colors(color, torch.zeros(1, 3, 3), torch.ones(1, 3)).isnan().tolist() == [[True, False, False]]
+    assert seen_colors(color[:0], torch.zeros(0, 3, 3), torch.ones(1, 3)).shape == (0, 3)
+    nowhere = torch.zeros(1, 3, requires_grad=True)
+    seen = seen_colors(torch.rand(1, 3), torch.ones(1, 8, 3), nowhere)
+    seen.sum().backward()
+    assert seen.isfinite().all() and nowhere.grad.isfinite().all()
 
 
 @pytest.mark.parametrize("suffix", [".vtu", ".npz"])

@@ -9,7 +9,7 @@ import torch
 
 from difftetvr.errors import MeshError, counted, shown
 from difftetvr.inputs import as_reals, moved, require_type
-from difftetvr.mesh.harmonics import COUNTS, harmonic_basis
+from difftetvr.mesh.harmonics import COUNTS, seen_colors
 from difftetvr.mesh.tetmesh import TetMesh
 
 Location = Literal["vertex", "cell"]
@@ -146,7 +146,7 @@ class Field:
         places = mesh.vertices
         if self.location_on(mesh) == "cell":
             places = places[mesh.tets.long()].mean(1)
-        return self._seen_along(torch.nn.functional.normalize(places - eye.to(places), dim=1))
+        return self._seen_along(places - eye.to(places))
 
     def seen_along(self, direction: torch.Tensor) -> Field:
         """The colours that parallel rays see, such as those of an orthographic camera.
@@ -159,14 +159,12 @@ class Field:
         """
         if self.harmonics is None:
             return self
-        return self._seen_along(torch.nn.functional.normalize(direction.reshape(-1, 3).to(self.color.device), dim=1))
+        return self._seen_along(direction.reshape(-1, 3).to(self.color.device))
 
-    def _seen_along(self, directions: torch.Tensor) -> Field:
-        """The colours along (N, 3) unit vectors, or (1, 3) for all."""
+    def _seen_along(self, vectors: torch.Tensor) -> Field:
+        """The colours along (N, 3) vectors, or (1, 3) for all."""
         assert self.harmonics is not None
-        basis = harmonic_basis(directions, COUNTS.index(self.harmonics.shape[1])).to(self.color.dtype)
-        color = self.color + (basis[:, :, None] * self.harmonics.to(self.color.dtype)).sum(1)
-        return Field(color.clamp(min=0.0), self.density, self.location)
+        return Field(seen_colors(self.color, self.harmonics, vectors), self.density, self.location)
 
 
 def require_location(location: Any, name: str) -> None:
