@@ -77,7 +77,8 @@ class VertexOptimizer:
         self.steps = 0
         self._first = mesh.vertices.new_zeros((mesh.num_vertices, 3), dtype=torch.float64).detach()
         self._second = self._first[:, 0].clone()
-        self.mesh, self._constraint = self._adopted(mesh)
+        self.mesh = _adopted(mesh)
+        self._constraint: BoundaryConstraint | None = None
 
     def zero_grad(self) -> None:
         """Forgets the gradients accumulated since the last step."""
@@ -114,7 +115,7 @@ class VertexOptimizer:
         old = self.mesh.vertices.detach()
         shapes = measure_vertices(self.mesh, self._barrier)
         move = self._proposal(gradient, shapes, rate)
-        move, capped = cap_move(self._constraint.apply(old, move), shapes.altitudes, self.config.cap)
+        move, capped = cap_move(self._boundary.apply(old, move), shapes.altitudes, self.config.cap)
         guarded = guard_move(self.mesh, move, self.config.limits, shapes.cells)
         self.mesh = self.mesh.with_vertices(guarded.vertices.requires_grad_())
         moved = (guarded.vertices.detach() != old).any(1).sum()
@@ -131,7 +132,8 @@ class VertexOptimizer:
         first = change.carry(self._first)
         self._first = torch.where(change.is_new[:, None], 0.0, first)
         self._second = change.carry(self._second)
-        self.mesh, self._constraint = self._adopted(change.mesh)
+        self.mesh = _adopted(change.mesh)
+        self._constraint = None
 
     def state(self) -> dict[str, torch.Tensor]:
         """All that the next step depends on besides the cells, by name; gradients gathered for it included."""
@@ -142,7 +144,7 @@ class VertexOptimizer:
             "first_moment": self._first,
             "second_moment": self._second,
             "steps": torch.tensor(self.steps),
-            **{f"boundary.{name}": getattr(self._constraint, name) for name in _CONSTRAINT},
+            **{f"boundary.{name}": getattr(self._boundary, name) for name in _CONSTRAINT},
         }
 
     def restore(self, tensors: dict[str, torch.Tensor]) -> None:
@@ -173,12 +175,17 @@ class VertexOptimizer:
         self.steps = int(copies["steps"])
         self._constraint = BoundaryConstraint(*(copies[f"boundary.{name}"] for name in _CONSTRAINT))
 
-    def _adopted(self, mesh: TetMesh) -> tuple[TetMesh, BoundaryConstraint]:
-        """A copy of the mesh for gradients to gather in, and where its boundary may go."""
-        copy = mesh.with_vertices(mesh.vertices.detach().clone().requires_grad_())
-        if self.config.boundary == "slide":
-            return copy, BoundaryConstraint.sliding(mesh, self.config.coplanarity)
-        return copy, BoundaryConstraint.fixed(mesh)
+    @property
+    def _boundary(self) -> BoundaryConstraint:
+        """Where the boundary may go: found before the next step, as several changes may follow each other."""
+        if self._constraint is None:
+            slides = self.config.boundary == "slide"
+            self._constraint = (
+                BoundaryConstraint.sliding(self.mesh, self.config.coplanarity)
+                if slides
+                else BoundaryConstraint.fixed(self.mesh)
+            )
+        return self._constraint
 
     def _finite_gradient(self) -> torch.Tensor:
         """(V, 3) float64."""
@@ -209,6 +216,11 @@ class VertexOptimizer:
     @property
     def _barrier(self) -> _Barrier:
         return _Barrier(self.config.barrier, self.config.wall, self.config.limits.quality)
+
+
+def _adopted(mesh: TetMesh) -> TetMesh:
+    """A copy of a mesh for gradients to gather in."""
+    return mesh.with_vertices(mesh.vertices.detach().clone().requires_grad_())
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,6 @@ from difftetvr.recording import few_lengths, replayed
 _QUALITY_FACTOR = math.sqrt(432.0)
 """Q = sqrt(432) det / S^(3/2), S the sum of the squared edge lengths: the same as 6 sqrt(2) V / l_rms^3."""
 
-_CORNERS = 4
-
 Vector = list[Any]
 
 
@@ -182,25 +180,23 @@ class StarSource:
 
     Attributes:
         backend: Array types, float64.
-        first, end: (V,) where each vertex's cells begin and end among ``cells``.
-        cells: (4 T,) the cells.
-        tets: (T, 4) their vertices.
-        corners: (T, 4, 4) four numbers about each corner of a cell.
+        first, end: (V,) where each vertex's corners begin and end among ``around``.
+        around: (4 T,) the corners, 4 * cell + k.
+        corners: (T, 4, 4) four numbers about each of them.
     """
 
     backend: Backend
     first: Any
     end: Any
-    cells: Any
-    tets: Any
+    around: Any
     corners: Any
 
     @staticmethod
     def of(backend: Backend, topology: Topology, corners: Any) -> StarSource:
         """The cells of a mesh, with what is known of their corners."""
-        offsets, cells = topology.vertex_cells
-        first, end, around, tets = map(backend.uints, (offsets[:-1], offsets[1:], cells, topology.tets))
-        return StarSource(backend, first, end, around, tets, corners)
+        offsets, around = topology.vertex_corners
+        first, end, around = map(backend.uints, (offsets[:-1], offsets[1:], around))
+        return StarSource(backend, first, end, around, corners)
 
 
 def _measures(source: _CellSource) -> tuple[Any, Any]:
@@ -268,14 +264,7 @@ def sums_of_stars(source: StarSource, length: int, takes_least: bool) -> Any:
     vertex = dr.arange(backend.UInt, lanes)
 
     def add(place: Any, total: Vector, last: Any) -> tuple[Any, Vector, Any]:
-        cell = dr.gather(backend.UInt, source.cells, place)
-        tet = dr.gather(backend.UInt4, source.tets, cell)
-        corner = dr.select(
-            tet[0] == vertex,
-            backend.UInt(0),
-            dr.select(tet[1] == vertex, backend.UInt(1), dr.select(tet[2] == vertex, backend.UInt(2), 3)),
-        )
-        packet = dr.gather(backend.Float4, source.corners, _CORNERS * cell + corner)
+        packet = dr.gather(backend.Float4, source.corners, dr.gather(backend.UInt, source.around, place))
         last = dr.select(packet[3] < last, packet[3], last) if takes_least else last + packet[3]
         return place + 1, [t + packet[k] for k, t in enumerate(total)], last
 

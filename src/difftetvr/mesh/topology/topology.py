@@ -106,7 +106,13 @@ class Topology:
 
         Those of vertex v are `cells[offsets[v]:offsets[v + 1]]`, ascending.
         """
-        return self.cached("vertex_cells", self._build_vertex_cells)
+        offsets, corners = self.vertex_corners
+        return offsets, self.cached("vertex_cells", lambda: corners >> 2)
+
+    @property
+    def vertex_corners(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """The same with corners, 4 * cell + k where the vertex is the cell's k-th, in place of cells."""
+        return self.cached("vertex_corners", self._build_vertex_corners)
 
     def cached(self, key: str, build: Callable[[], X]) -> X:
         """A table derived from this topology alone, built once and kept as long as the topology.
@@ -189,11 +195,11 @@ class Topology:
         keys = torch.unique_consecutive(sort_keys(torch.cat(parts)))
         return torch.stack(((keys >> _ROW_BITS).int(), (keys & _ROW_MASK).int()), 1)
 
-    def _build_vertex_cells(self) -> tuple[torch.Tensor, torch.Tensor]:
+    def _build_vertex_corners(self) -> tuple[torch.Tensor, torch.Tensor]:
         keys = torch.empty((self.num_cells, 4), dtype=torch.int64, device=self.tets.device)
         for part in chunks(self.num_cells, self.tets.device, width=4):
-            cells = torch.arange(part.start, part.stop, device=self.tets.device)[:, None]
-            keys[part] = (self.tets[part].long() << _ROW_BITS) | cells
-        cells = sort_keys(keys.view(-1)).bitwise_and_(_ROW_MASK).int()
+            corners = torch.arange(4 * part.start, 4 * part.stop, device=self.tets.device)
+            keys[part] = (self.tets[part].long() << _ROW_BITS) | corners.view(-1, 4)
+        corners = sort_keys(keys.view(-1)).bitwise_and_(_ROW_MASK).int()
         counts = torch.bincount(self.tets.view(-1), minlength=self.num_vertices)
-        return torch.nn.functional.pad(counts.cumsum(0), (1, 0)).int(), cells
+        return torch.nn.functional.pad(counts.cumsum(0), (1, 0)).int(), corners
