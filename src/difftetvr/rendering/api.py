@@ -18,7 +18,7 @@ from difftetvr.recording import eager
 from difftetvr.rendering.autograd import RenderFunction
 from difftetvr.rendering.cell_features import CellFeatures
 from difftetvr.rendering.preparation import ViewOptions, as_rays, is_plain, prepare_view
-from difftetvr.rendering.rays import Rays, RaySource
+from difftetvr.rendering.rays import Rays, RaySource, are_one
 from difftetvr.rendering.scalar_field import ScalarField
 
 _HALF, _OPAQUE = math.log(2.0), 1e3
@@ -181,7 +181,7 @@ def _of_viewpoints(one: Callable[..., RenderedImage], camera: Any) -> RenderedIm
     if is_plain(camera) or not isinstance(camera, (Rays, RaySource)) or isinstance(camera, type):
         return one(camera)
     rays = as_rays(camera)
-    if rays.eye is not None:
+    if rays.eye is not None or are_one(rays.origins.reshape(-1, 3)):
         return one(rays)
     parts, are_parallel = rays.by_viewpoint()
     if len(parts) < 2:

@@ -75,6 +75,8 @@ class HatDerivatives:
         Args:
             unit: How much density a coefficient of 1 stands for from now on.
         """
+        if unit == 1.0:
+            return self
         gradient = torch.cat((self.gradient[:, :3], unit * self.gradient[:, 3:]), 1)
         return HatDerivatives(gradient, self.emission, unit * self.coupling, unit * unit * self.absorption, self.weight)
 
