@@ -48,6 +48,12 @@ def test_what_is_left_open_is_chosen_for_the_images(shiny: dtv.Capture) -> None:
     chosen = dtv.FitConfig().for_capture(shiny)
     assert (chosen.background, chosen.harmonics, chosen.density_rate, chosen.pace) == ("random", 2, 5.0, 8.0)
     assert chosen.evaluation_background() == (1.0, 1.0, 1.0)
+    assert chosen.start == "hull" and chosen.strategy().rounds == 32
+    for few, rounds in ((600, 10), (9600, 64)):
+        assert dataclasses.replace(chosen, iterations=few).strategy().rounds == rounds
+    given = dataclasses.replace(chosen, exchange=dtv.fitting.Exchange(rounds=7))
+    assert given.strategy().rounds == 7
+    assert dataclasses.replace(chosen, start="grid").strategy().rounds is None
     opaque = dataclasses.replace(shiny, alphas=None)
     of_opaque = dtv.FitConfig().for_capture(opaque)
     assert (of_opaque.background, of_opaque.density_rate, of_opaque.pace) == ("black", 1.0, 8.0)

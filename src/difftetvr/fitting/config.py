@@ -250,6 +250,8 @@ class FitConfig(Schedule):
 
     def strategy(self) -> Strategy | None:
         """How the mesh is refined; None if it is not."""
+        if self.refine == "exchange" and self.start == "hull" and self.initial_mesh is None:
+            return self.exchange.on_surfaces(self.steps)
         return None if self.refine == "none" else getattr(self, self.refine)
 
     def motion_rate_at(self, iteration: int) -> float | None:

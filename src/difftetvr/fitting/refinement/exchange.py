@@ -12,6 +12,7 @@ _Own = TypeVar("_Own", bound="Exchange")
 
 _LEAST_ROUNDS, _ITERATIONS_PER_ROUND = 40, 60
 _ITERATIONS_TO_SETTLE = 20
+_LEAST_ROUNDS_ON_SURFACES, _ITERATIONS_PER_ROUND_ON_SURFACES = 10, 150
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,8 @@ class Exchange(OptionGroup):
     prefix = "exchange."
 
     rounds: int | None = None
-    """How often the mesh is refined, evenly spread; default: 40 times, or a sixtieth of the iterations if more."""
+    """How often the mesh is refined, evenly spread; default: 40 times, or a sixtieth of the iterations if more; for
+    photographs that begin with a visual hull 10 times, or a 150th."""
     until: float = 0.85
     """Share of the run after which it is not refined any more."""
     share: float = 0.08
@@ -64,6 +66,15 @@ class Exchange(OptionGroup):
             iterations: Of the run.
         """
         rounds = max(1, min(_LEAST_ROUNDS, iterations // _ITERATIONS_TO_SETTLE))
+        return replace(self, rounds=self.rounds or rounds)
+
+    def on_surfaces(self: _Own, iterations: int) -> _Own:
+        """The same with so many rounds, where that is left open, as suffice where cells begin where they are needed.
+
+        Args:
+            iterations: Of the run.
+        """
+        rounds = max(_LEAST_ROUNDS_ON_SURFACES, iterations // _ITERATIONS_PER_ROUND_ON_SURFACES)
         return replace(self, rounds=self.rounds or rounds)
 
     def initial_cells(self, budget: int) -> int:
