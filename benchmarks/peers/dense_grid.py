@@ -28,14 +28,11 @@ import difftetvr as dtv
 from difftetvr.capture import Capture
 from difftetvr.fitting.loop import prepare
 from difftetvr.fitting.records.evaluation import evaluate
-from difftetvr.fitting.refinement import Exchange
 
 MOMENTS = (0.02, 0.04, 0.07, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 """Shares of the time at which held-out views are looked at."""
-PILOT_ITERATIONS, PILOT_OF = 170, 2400
+PILOT_ITERATIONS, PILOT_OF = 300, 2400
 """Iterations of the run that says how long one takes, the first ones of a run of so many."""
-ITERATIONS_PER_ROUND = 60
-"""Iterations of the mesh from one refinement to the next."""
 KEPT_ASIDE = 10
 """One training view of so many is a validation view."""
 LABELS = {"voxels": "voxel grid, as Plenoxels", "mesh": "tetrahedral mesh, dtv.fit"}
@@ -68,7 +65,7 @@ def voxels(capture: Capture, seconds: float) -> Curve:
 def mesh(capture: Capture, seconds: float, iterations: int | None) -> Curve:
     """Seconds, and PSNR in dB, of a mesh."""
     iterations = iterations or mesh_iterations(capture, seconds)
-    trainer = prepare(capture, mesh_config(iterations))
+    trainer = prepare(capture, dtv.FitConfig(evaluate_every=0, iterations=iterations))
     waiting, spent, curve = [share * iterations for share in MOMENTS], 0.0, []
     background = trainer.config.evaluation_background()
     for iteration in range(iterations):
@@ -96,13 +93,8 @@ def mesh_iterations(capture: Capture, seconds: float) -> int:
         trainer.step()
         taken[len(trainer.history.refinements) > rounds].append(time.perf_counter() - start)
     step, refinement = statistics.median(taken[False]), statistics.median(taken[True])
-    return max(1, int(seconds / (step + (refinement - step) / ITERATIONS_PER_ROUND)))
-
-
-def mesh_config(iterations: int) -> dtv.FitConfig:
-    """The default options with as many refinements an iteration as long runs have; short ones have more by default."""
-    rounds = max(1, iterations // ITERATIONS_PER_ROUND)
-    return dtv.FitConfig(evaluate_every=0, iterations=iterations, exchange=Exchange(rounds=rounds))
+    per_step = len(taken[True]) / PILOT_ITERATIONS
+    return max(1, int(seconds / (step + (refinement - step) * per_step)))
 
 
 def measure(name: str, options: argparse.Namespace) -> Curve:

@@ -12,7 +12,7 @@ _Own = TypeVar("_Own", bound="Exchange")
 
 _LEAST_ROUNDS, _ITERATIONS_PER_ROUND = 40, 60
 _ITERATIONS_TO_SETTLE = 20
-_LEAST_ROUNDS_ON_SURFACES, _ITERATIONS_PER_ROUND_ON_SURFACES = 10, 150
+_LEAST_ROUNDS_ON_SURFACES, _ITERATIONS_PER_ROUND_ON_SURFACES, _VIEWS_ON_SURFACES = 10, 150, 36
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,9 @@ class Exchange(OptionGroup):
     """Share of the run after which it is not refined any more."""
     share: float = 0.08
     """Share of the cells that one round takes away."""
-    views: int = 12
-    """Random training views on which gains and losses are predicted."""
+    views: int | None = None
+    """Random training views on which gains and losses are predicted; default: 12, for photographs that begin with a
+    visual hull 36."""
     start: float = 0.6
     """New vertices start at this part of their best surplus over the interpolated values."""
     long: float = 0.6
@@ -69,13 +70,15 @@ class Exchange(OptionGroup):
         return replace(self, rounds=self.rounds or rounds)
 
     def on_surfaces(self: _Own, iterations: int) -> _Own:
-        """The same with so many rounds, where that is left open, as suffice where cells begin where they are needed.
+        """The same, where that is left open, with as many rounds as suffice where cells begin where they are needed.
+
+        Each of them looks at more views instead: what changes win on opaque surfaces differs from view to view.
 
         Args:
             iterations: Of the run.
         """
         rounds = max(_LEAST_ROUNDS_ON_SURFACES, iterations // _ITERATIONS_PER_ROUND_ON_SURFACES)
-        return replace(self, rounds=self.rounds or rounds)
+        return replace(self, rounds=self.rounds or rounds, views=self.views or _VIEWS_ON_SURFACES)
 
     def initial_cells(self, budget: int) -> int:
         """See `Strategy.initial_cells`."""

@@ -14,6 +14,9 @@ if TYPE_CHECKING:
     from difftetvr.mesh.tetmesh import TetMesh
     from difftetvr.rendering.gauss_newton import ImageModel
 
+USUAL_VIEWS = 12
+"""Views that a refinement is judged on where nobody says how many."""
+
 
 @dataclass(frozen=True)
 class Moment:
@@ -112,8 +115,8 @@ class Strategy(Protocol):
     """Decides when and how the mesh changes. A strategy has options but no state: a run can be resumed anywhere."""
 
     @property
-    def views(self) -> int:
-        """Training views on which a refinement is judged."""
+    def views(self) -> int | None:
+        """Training views on which a refinement is judged; None: :data:`USUAL_VIEWS`."""
         ...
 
     def initial_cells(self, budget: int) -> int:
