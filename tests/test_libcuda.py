@@ -34,6 +34,11 @@ def test_what_the_user_names_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     assert os.environ[libcuda.PATH_VARIABLE] == "/opt/libcuda.so.570"
 
 
+def test_without_a_driver_there_is_no_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(libcuda, "_loads", lambda name: False)
+    assert libcuda.count_gpus.__wrapped__() == 0
+
+
 def test_other_systems_have_other_names(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(libcuda.sys, "platform", "darwin")
     assert libcuda.tell_drjit({"libcuda.so.1"}.__contains__) is None

@@ -239,7 +239,7 @@ def _started_backend(device: str, dtype: torch.dtype) -> Backend:
     if name == "cuda" and (torch_device.index or 0) > 0:
         raise BackendError(
             f"Kernels run on the first GPU alone, and the tensors are on '{torch_device}'; start one process for each "
-            f"GPU, this one with CUDA_VISIBLE_DEVICES={torch_device.index}, and use 'cuda:0' in it."
+            f"GPU, this one with CUDA_VISIBLE_DEVICES={_visible_name(torch_device.index)}, and use 'cuda:0' in it."
         )
     if dtype not in _DTYPES or (name == "metal" and dtype == torch.float64):
         raise BackendError(f"The {name} kernels cannot run in {dtype}; convert the tensors to torch.float32.")
@@ -263,6 +263,12 @@ def _started_backend(device: str, dtype: torch.dtype) -> Backend:
     )
 
 
+def _visible_name(index: int) -> str:
+    """What a GPU that PyTorch counts is called outside of this process, of which some may be hidden from it."""
+    names = os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",")
+    return names[index].strip() if index < len(names) and names[index].strip() else str(index)
+
+
 def default_device() -> torch.device:
     """The fastest device whose back end works: CUDA, then Metal, then the CPU.
 
@@ -270,6 +276,8 @@ def default_device() -> torch.device:
         BackendError: None works.
     """
     require_own_threads()
+    if not torch.cuda.is_available() and libcuda.count_gpus():
+        warnings.warn(f"The GPU is left unused: {_why_torch_has_none()}", BackendWarning, stacklevel=2)
     for device in _present_devices():
         try:
             get_backend(device)
@@ -278,6 +286,12 @@ def default_device() -> torch.device:
             if device != "cpu":
                 warnings.warn(f"The GPU is left unused: {error}", BackendWarning, stacklevel=2)
     raise BackendError(_missing_backend("llvm"))
+
+
+def _why_torch_has_none() -> str:
+    if torch.version.cuda is None:
+        return "this PyTorch is built without CUDA; install one that is built for it."
+    return "PyTorch cannot start CUDA; `python -c 'import torch; torch.zeros(1).cuda()'` says why."
 
 
 def require_own_threads() -> None:
@@ -361,7 +375,7 @@ def _missing_backend(name: str) -> str:
     if name == "cuda":
         return (
             "The CUDA back end cannot start although PyTorch's can: Dr.Jit finds no driver library that it can use; "
-            f"name libcuda.so.1 in {libcuda.PATH_VARIABLE}, update the NVIDIA driver, or move the tensors to the CPU."
+            f"name libcuda.so.1 in {libcuda.PATH_VARIABLE}, or move the tensors to the CPU."
         )
     if name == "metal":
         return "The Metal back end cannot start on this system; move the tensors to the CPU."

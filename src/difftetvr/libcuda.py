@@ -11,6 +11,7 @@ import ctypes
 import os
 import sys
 from collections.abc import Callable
+from functools import cache
 
 PATH_VARIABLE = "DRJIT_LIBCUDA_PATH"
 """Environment variable by which a user, or :func:`tell_drjit`, names the library."""
@@ -37,6 +38,18 @@ def tell_drjit(loads: Callable[[str], bool] | None = None) -> str | None:
         return None
     os.environ[PATH_VARIABLE] = REAL_NAME
     return REAL_NAME
+
+
+@cache
+def count_gpus() -> int:
+    """How many GPUs the CUDA driver offers this process, whether or not PyTorch can use them; 0 without a driver."""
+    for name in filter(None, (os.environ.get(PATH_VARIABLE), LINKED_NAME, REAL_NAME)):
+        if not _loads(name):
+            continue
+        driver, count = ctypes.CDLL(name), ctypes.c_int(0)
+        is_started = driver.cuInit(0) == 0 and driver.cuDeviceGetCount(ctypes.byref(count)) == 0
+        return count.value if is_started else 0
+    return 0
 
 
 def _loads(name: str) -> bool:

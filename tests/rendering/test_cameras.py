@@ -275,12 +275,30 @@ def test_projected_cells_are_ordered_for_each_view() -> None:
         (lambda: Detector(CENTERS, vectors([1, 0, 0]).expand(3, 3), NOTHING, 7, 6, NOTHING), "for 2, 3 views"),
         (lambda: Detector(vectors([math.inf, 0, 0]), NOTHING, NOTHING, 7, 6, NOTHING), "center is .*finite vectors"),
         (lambda: Camera(POSE, *INTRINSICS, 7, 6, intrinsics=torch.ones(3)), r"intrinsics have shape \(3,\)"),
+        (lambda: Camera(POSE, torch.ones(2, requires_grad=True), *INTRINSICS[1:], 7, 6), r"fx has the shape \(2,\)"),
     ],
 )
 def test_mistakes_get_one_sentence(make: Callable[[], object], message: str) -> None:
     with pytest.raises(CameraError, match=message) as error:
         make()
     assert "\n" not in str(error.value)
+
+
+class Silent:
+    """Looks like a camera, and makes no rays."""
+
+    def rays(self) -> None:
+        return None
+
+
+class Wrong(Silent):
+    rays = 3  # type: ignore[assignment]
+
+
+@pytest.mark.parametrize("camera", [Silent(), [Silent(), Silent()], Wrong()])
+def test_cameras_that_make_no_rays(camera: object) -> None:
+    with pytest.raises(DiffTetError, match=r"What the camera's rays\(\) returns is .*; return difftetvr.Rays"):
+        render(*scene(), camera)  # type: ignore[call-overload]
 
 
 @pytest.mark.parametrize("camera", [[], [Camera], Camera, "front", [Camera.look_at((1.0, 0, 0), (0, 0, 0)), None]])

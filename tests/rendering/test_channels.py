@@ -29,7 +29,10 @@ def scene(channels: int, per_cell: bool = False, size: int = 3) -> tuple[TetMesh
 
 @pytest.mark.parametrize(
     ("channels", "renderer", "per_cell"),
-    [*itertools.product((0, 1, 5), RENDERERS, (False, True)), (64, "marching", False)],
+    [
+        *itertools.product((0, 1, 5), RENDERERS, (False, True)),
+        *((64, renderer, renderer != "marching") for renderer in RENDERERS),
+    ],
 )
 def test_each_channel_is_what_it_is_in_a_field_of_three(channels: int, renderer: str, per_cell: bool) -> None:
     mesh, field = scene(channels, per_cell)

@@ -10,9 +10,9 @@ import torch
 
 from difftetvr import libcuda
 from difftetvr.backend import BackendWarning, default_device, dr, get_backend
-from difftetvr.errors import BackendError
+from difftetvr.errors import BackendError, CameraError
 from difftetvr.mesh import Field, TetMesh
-from difftetvr.rendering import Camera, render
+from difftetvr.rendering import Camera, Detector, render
 
 CAMERAS = {
     "outside": Camera.look_at((1.5, -1.2, 0.9), (0, 0, 0), fov_y=0.8, width=70, height=50),
@@ -61,8 +61,40 @@ def test_a_gpu_that_is_left_unused_is_told_of(monkeypatch: pytest.MonkeyPatch) -
         assert default_device().type == "cpu"
 
 
+def test_a_gpu_that_pytorch_cannot_use_is_told_of(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(libcuda, "count_gpus", lambda: 1)
+    for version, reason in ((None, "built without CUDA"), ("12.8", "cannot start CUDA")):
+        monkeypatch.setattr(torch.version, "cuda", version)
+        with pytest.warns(BackendWarning, match=f"The GPU is left unused: .*{reason}"):
+            assert default_device().type == "cpu"
+
+
+def test_gpus_that_are_hidden_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What this process calls cuda:1 has another name outside where the variable hides some."""
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "2, GPU-5a")
+    with pytest.raises(BackendError, match="CUDA_VISIBLE_DEVICES=GPU-5a, and"):
+        get_backend("cuda:1", torch.float64)
+
+
 def leaf(shape: tuple[int, ...], seed: int) -> torch.Tensor:
     return torch.rand(shape, generator=torch.Generator().manual_seed(seed))
+
+
+@pytest.mark.gpu
+def test_cameras_of_which_a_part_is_on_the_gpu() -> None:
+    mesh, pose = TetMesh.grid((2, 2, 2), (-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)), CAMERAS["outside"].world_to_camera
+    field = Field(torch.ones(27, 3), torch.ones(27))
+    focal = torch.tensor(60.0, device="cuda", requires_grad=True)
+    render(mesh, field, Camera(pose, focal, 60.0, 35.0, 25.0, 70, 50)).color.sum().backward()
+    assert focal.grad is not None and float(focal.grad) != 0.0
+    listed = Detector(torch.zeros(3, device="cuda"), [0.1, 0, 0], [0, 0.1, 0], 3, 2, direction=[1, 1, 1])
+    assert listed.rays().directions.device.type == "cuda"
+    on_both = [CAMERAS["outside"], CAMERAS["inside"].with_pose(CAMERAS["inside"].world_to_camera.cuda())]
+    with pytest.raises(CameraError, match="are on 'cpu' and 'cuda:0'; move"):
+        render(mesh, field, on_both)
+    with pytest.raises(CameraError, match="are on 'cpu' and 'cuda:0'; move"):
+        Detector(torch.zeros(3, device="cuda"), torch.ones(3), [0, 0.1, 0], 3, 2, direction=[1, 1, 1])
 
 
 @pytest.mark.gpu

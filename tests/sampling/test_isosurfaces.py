@@ -90,6 +90,12 @@ def test_levels_out_of_reach_have_no_surface() -> None:
     assert triangles.shape == (0, 3)
 
 
+def test_differences_of_values_do_not_overflow() -> None:
+    mesh = TetMesh.grid((1, 1, 1))
+    signs = torch.where(torch.arange(8) % 2 == 0, 1.0, -1.0)
+    assert torch.equal(isosurface(mesh, 3e38 * signs, 0.0)[0], isosurface(mesh, signs, 0.0)[0])
+
+
 def test_other_values_on_a_surface_are_those_of_probes() -> None:
     generator = torch.Generator().manual_seed(3)
     mesh = TetMesh.delaunay(torch.rand(40, 3, generator=generator, dtype=torch.float64))

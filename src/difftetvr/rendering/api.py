@@ -160,7 +160,7 @@ def render(
     # One after the other where each view has its own colours, or its own order of cells.
     if renderer == "projected" or is_directional:
         return _together([one(view) for view in cameras])
-    bundles = [view.rays() for view in cameras]
+    bundles = [as_rays(view) for view in cameras]
     shapes = [tuple(bundle.shape) for bundle in bundles]
     if len(set(shapes)) == 1:
         return one(Rays.stacked(bundles))

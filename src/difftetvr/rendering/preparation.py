@@ -255,8 +255,17 @@ def is_plain(camera: RaySource | Rays) -> TypeGuard[Camera]:
 
 
 def as_rays(camera: RaySource | Rays) -> Rays:
-    """The rays of a camera, or what are rays."""
-    return camera if isinstance(camera, Rays) else camera.rays()
+    """The rays of a camera, or what are rays.
+
+    Raises:
+        DiffTetError: It makes no rays.
+    """
+    if isinstance(camera, Rays):
+        return camera
+    rays: Any = camera.rays() if callable(camera.rays) else camera.rays
+    require_type(rays, Rays, "What the camera's rays() returns", "return difftetvr.Rays", DiffTetError)
+    own: Rays = rays
+    return own
 
 
 def _seen(

@@ -176,8 +176,9 @@ class Rays:
         """Several bundles of one shape as one, (B, ...).
 
         Raises:
-            CameraError: They have several shapes, or there is none.
+            CameraError: They have several shapes or devices, or there is none.
         """
+        _require_one_device(bundles)
         shapes = sorted({tuple(bundle.shape) for bundle in bundles})
         if len(shapes) != 1:
             told = "there is none" if not shapes else f"these have the shapes {shapes[0]} and {shapes[1]}"
@@ -189,11 +190,24 @@ class Rays:
 
     @staticmethod
     def joined(bundles: Sequence[Rays]) -> Rays:
-        """The rays of several bundles one after the other, (N,)."""
+        """The rays of several bundles one after the other, (N,).
+
+        Raises:
+            CameraError: They are on several devices, or there is none.
+        """
+        _require_one_device(bundles)
         origins, directions = (
             torch.cat([getattr(b, name).reshape(-1, 3) for b in bundles]) for name in ("origins", "directions")
         )
         return Rays(origins, directions, *_shared_ends(bundles, lambda ends: torch.cat([e.reshape(-1) for e in ends])))
+
+
+def _require_one_device(bundles: Sequence[Rays]) -> None:
+    devices = sorted({f"'{bundle.origins.device}'" for bundle in bundles})
+    if len(devices) > 1:
+        raise CameraError(f"The rays are on {' and '.join(devices)}; move them, or their cameras, to one device.")
+    if not devices:
+        raise CameraError("There are no bundles of rays to be one; pass some.")
 
 
 def _shared_ends(

@@ -73,14 +73,15 @@ def crossed_edges(mesh: TetMesh, scalar: torch.Tensor, level: float | torch.Tens
     height = as_reals(level, "level", MeshError, values.dtype, "give a finite number")
     if height.numel() != 1 or not math.isfinite(float(height.detach())):
         raise MeshError(f"level is {shown(level)}; give a finite number.")
-    height = height.reshape(())  # so that it takes the precision of the values
+    height = height.reshape(()).to(values.device)  # of no dimension, so that it takes the precision of the values
     above = values.detach() >= height.detach().to(values)
     edges = mesh.topology.edges.long()
     is_cut = above[edges[:, 0]] != above[edges[:, 1]]
     number = torch.cumsum(is_cut, 0) - 1
     triangles = _triangles(above[mesh.tets.long()], cell_edges(mesh.topology).long())
     begin, end = edges[is_cut].unbind(1)
-    share = (height - values[begin]) / (values[end] - values[begin])
+    from_begin, length = (0.5 * part - 0.5 * values[begin] for part in (height, values[end]))  # halves do not overflow
+    share = from_begin / length
     return CrossedEdges(begin, end, share, number[triangles])
 
 

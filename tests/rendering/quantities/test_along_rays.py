@@ -17,7 +17,7 @@ from torch import Tensor
 
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.optics import TransferFunction
-from difftetvr.rendering import Rays, ScalarField, depth_at, render, transmittance_at
+from difftetvr.rendering import Camera, Rays, ScalarField, depth_at, render, transmittance_at
 
 CASES = [
     *((name, "marching") for name in ("delaunay", "porous", "inside-cells", "in-hole", "slabs", "dense-1e2")),
@@ -181,6 +181,21 @@ def test_equal_distances_have_derivatives_of_their_own() -> None:
     light = torch.exp(-z - 0.5 * z * z)
     assert torch.allclose(found.detach()[0], light)
     assert torch.allclose(gradient, -weights * light * (1.0 + z))
+
+
+@pytest.mark.parametrize("renderer", ["marching", "projected"])
+def test_several_views_have_values_of_their_own(renderer: str) -> None:
+    mesh = TetMesh.grid((2, 2, 2), dtype=torch.float64)
+    field = Field(torch.zeros(mesh.num_vertices, 0, dtype=torch.float64), 1.0 + mesh.vertices[:, 2])
+    eyes = ((2.0, 1.7, 1.4), (-1.0, 0.3, 0.2))
+    cameras = [Camera.look_at(eye, (0.5, 0.5, 0.5), width=4, height=3) for eye in eyes]
+    for shape in ((2, 3, 4, 5), (3, 4, 5), (5,), (1, 3, 4, 5)):
+        values = 3.0 * torch.rand(shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+        found = transmittance_at(mesh, field, cameras, values, renderer=renderer)
+        assert isinstance(found, Tensor) and found.shape == (2, 3, 4, 5)
+        for k, camera in enumerate(cameras):
+            own = values[min(k, len(values) - 1)] if len(shape) == 4 else values
+            assert torch.allclose(found[k], transmittance_at(mesh, field, camera, own), atol=1e-12)
 
 
 # --------------------------------------------------------------------------------------------------- closed forms

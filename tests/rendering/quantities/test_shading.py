@@ -45,6 +45,16 @@ def test_where_nothing_changes_or_nothing_is_seen_nothing_is_darkened():
     )
 
 
+def test_several_cameras():
+    mesh = dtv.TetMesh.grid((2, 2, 2), dtype=torch.float64)
+    lit = medium(mesh, mesh.vertices[:, 0] ** 2)
+    cameras = [CAMERA, dtv.Camera.look_at((2.0, 0.3, 0.7), (0.5, 0.5, 0.5), width=3, height=3)]
+    alone = [dtv.render_shading(mesh, lit, camera, (1.0, 0.4, 0.0)) for camera in cameras]
+    assert torch.allclose(dtv.render_shading(mesh, lit, cameras, (1.0, 0.4, 0.0)), torch.stack(alone), atol=1e-7)
+    large, small = dtv.render_shading(mesh, lit, [CAMERA, CAMERA.with_size(3, 2)], (1.0, 0.4, 0.0))
+    assert torch.allclose(large, alone[0], atol=1e-7) and small.shape == (2, 3)
+
+
 def test_the_unit_of_length_and_of_the_scalar_do_not_matter():
     shades = []
     for factor, steep in ((1.0, 1.0), (2.0**70, 2.0**-300)):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 
@@ -50,16 +50,20 @@ class Detector:
         take_size(self)
         if (self.source is None) == (self.direction is None):
             raise CameraError("A detector needs either a source or a direction of its rays; pass one of them.")
-        views = set()
-        for name in _VECTORS:
-            value: Any = getattr(self, name)
-            if value is None:
-                continue
+        views, devices = set(), set()
+        given = {name: getattr(self, name) for name in _VECTORS if getattr(self, name) is not None}
+        for name, value in given.items():
             vector = as_reals(value, f"The detector's {name}", CameraError, torch.float64)
             if vector.shape[-1:] != (3,) or vector.ndim > 2 or not bool(torch.isfinite(vector.detach()).all()):
                 raise CameraError(f"The detector's {name} is {shown(value)}; pass finite vectors, (3,) or (B, 3).")
             views.add(vector.shape[:-1])
+            devices |= {vector.device} if isinstance(value, torch.Tensor) else set()
             object.__setattr__(self, name, vector)
+        if len(devices) > 1:
+            names = " and ".join(sorted(f"'{device}'" for device in devices))
+            raise CameraError(f"The detector's vectors are on {names}; move them to one device.")
+        for name in given if devices else ():
+            object.__setattr__(self, name, getattr(self, name).to(*devices))
         if len(views - {torch.Size([])}) > 1:
             counts = ", ".join(str(shape[0]) for shape in sorted(views - {torch.Size([])}))
             raise CameraError(

@@ -71,9 +71,13 @@ class Camera:
     def _gather_intrinsics(self) -> None:
         names = ("fx", "fy", "cx", "cy")
         given, values = self.intrinsics, [getattr(self, name) for name in names]
-        if given is None and any(isinstance(value, torch.Tensor) and value.requires_grad for value in values):
-            numbers = (as_reals(v, f"The camera's {n}", CameraError) for n, v in zip(names, values, strict=True))
-            given = torch.cat([v.reshape(-1).double() for v in numbers])
+        learned = [value for value in values if isinstance(value, torch.Tensor) and value.requires_grad]
+        if given is None and learned:
+            numbers = [as_reals(v, f"The camera's {n}", CameraError) for n, v in zip(names, values, strict=True)]
+            for name, value in zip(names, numbers, strict=True):
+                if value.numel() != 1:
+                    raise CameraError(f"The camera's {name} has the shape {tuple(value.shape)}; pass one number.")
+            given = torch.stack([value.reshape(()).to(learned[0].device, torch.float64) for value in numbers])
         if given is None:
             return
         given = as_reals(given, "The camera's intrinsics", CameraError)

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import torch
 
 from difftetvr.errors import DiffTetError, shown
 from difftetvr.inputs import as_reals
+from difftetvr.memory import tried_twice
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.recording import eager
 from difftetvr.rendering.api import checked_cameras
 from difftetvr.rendering.cameras.checks import MOST_PIXELS
 from difftetvr.rendering.cell_features import CellFeatures, medium_of
-from difftetvr.rendering.preparation import PreparedView, ViewOptions, prepare_view
+from difftetvr.rendering.preparation import PreparedView, ViewOptions, as_rays, prepare_view
 from difftetvr.rendering.quantities.profile import depths_at, distances_at
 from difftetvr.rendering.rays import Rays, RaySource
 from difftetvr.rendering.scalar_field import ScalarField
@@ -25,6 +27,7 @@ Numbers = float | Sequence[float] | torch.Tensor
 
 
 @eager
+@tried_twice
 def depth_at(
     mesh: TetMesh,
     field: Field | ScalarField | CellFeatures,
@@ -64,16 +67,18 @@ def depth_at(
     if not bool(((known > 0) & (known < 1)).all()):
         raise DiffTetError(f"transmittance is {shown(transmittance)}; give values between 0 and 1, without these two.")
 
-    def distances(view: PreparedView) -> torch.Tensor:
+    def distances(view: PreparedView, values: torch.Tensor) -> torch.Tensor:
         depths = -torch.log(_of_each_ray(values, view, "transmittance"))
         found = distances_at(view, view.limits, depths) * view.unit
         return found if view.shift is None else found + view.shift[:, None]
 
     options = ViewOptions(deterministic=deterministic, renderer=renderer)
-    return _of_views(lambda one: _looked(mesh, field, one, options, clip_plane, values, distances), camera, renderer)
+    look = partial(_looked, mesh, field, options, clip_plane, distances)
+    return _of_views(look, camera, values, renderer)
 
 
 @eager
+@tried_twice
 def transmittance_at(
     mesh: TetMesh,
     field: Field | ScalarField | CellFeatures,
@@ -111,7 +116,7 @@ def transmittance_at(
     if bool(torch.isnan(places.detach()).any()):
         raise DiffTetError(f"distances is {shown(distances)}, with NaN among them; give numbers.")
 
-    def transmittances(view: PreparedView) -> torch.Tensor:
+    def transmittances(view: PreparedView, places: torch.Tensor) -> torch.Tensor:
         along, near = _of_each_ray(places, view, "distances"), torch.zeros((), dtype=torch.float64)
         shift = view.shift
         if view.bundle is not None and shift is not None:
@@ -126,9 +131,8 @@ def transmittance_at(
         return torch.exp(-torch.where(along > near, depths, 0.0))
 
     options = ViewOptions(deterministic=deterministic, renderer=renderer)
-    return _of_views(
-        lambda one: _looked(mesh, field, one, options, clip_plane, places, transmittances), camera, renderer
-    )
+    look = partial(_looked, mesh, field, options, clip_plane, transmittances)
+    return _of_views(look, camera, places, renderer)
 
 
 def _checked(values: Numbers, name: str) -> torch.Tensor:
@@ -138,18 +142,18 @@ def _checked(values: Numbers, name: str) -> torch.Tensor:
 def _looked(
     mesh: Any,
     field: Any,
-    camera: RaySource | Rays,
     options: ViewOptions,
     clip_plane: Any,
+    look: Callable[[PreparedView, torch.Tensor], torch.Tensor],
+    camera: RaySource | Rays,
     values: torch.Tensor,
-    look: Callable[[PreparedView], torch.Tensor],
 ) -> torch.Tensor:
-    """What a function of views has to say of one camera, (H, W) or (H, W, K), in the precision of the mesh."""
+    """What a function of views and values says of one camera, (H, W) or (H, W, K), in the precision of the mesh."""
     view = prepare_view(mesh, medium_of(mesh, field), camera, options, clip_plane)
     shape = view.shape if values.dim() == 0 else (*view.shape, values.shape[-1])
     if 0 in shape:
         return view.empty(shape)
-    return look(view).to(mesh.vertices.dtype).reshape(shape)
+    return look(view, values).to(mesh.vertices.dtype).reshape(shape)
 
 
 def _of_each_ray(values: torch.Tensor, view: PreparedView, name: str) -> torch.Tensor:
@@ -170,15 +174,18 @@ def _of_each_ray(values: torch.Tensor, view: PreparedView, name: str) -> torch.T
 
 
 def _of_views(
-    one: Callable[[RaySource | Rays], torch.Tensor], camera: Any, renderer: str
+    one: Callable[[RaySource | Rays, torch.Tensor], torch.Tensor], camera: Any, values: torch.Tensor, renderer: str
 ) -> torch.Tensor | tuple[torch.Tensor, ...]:
     """What is asked of a camera, or of several: as one tensor where they have one size."""
     if not isinstance(camera, Sequence):
-        return one(camera)
+        return one(camera, values)
     cameras = checked_cameras(camera)
     if renderer != "projected":
-        bundles = [view.rays() for view in cameras]
+        bundles = [as_rays(view) for view in cameras]
         if len({bundle.shape for bundle in bundles}) == 1:
-            return one(Rays.stacked(bundles))
-    found = [one(view) for view in cameras]
+            return one(Rays.stacked(bundles), values)
+    # Where there are values for each ray of all views, each view has its own.
+    has_own, count = values.dim() == 4 and len(values) in (1, len(cameras)), len(cameras)
+    own = values.expand(count, -1, -1, -1) if has_own else [values] * count
+    found = [one(view, part) for view, part in zip(cameras, own, strict=True)]
     return torch.stack(found) if len({part.shape for part in found}) == 1 else tuple(found)

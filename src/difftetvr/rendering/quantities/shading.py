@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import overload
 
 import torch
 
@@ -12,13 +13,13 @@ from difftetvr.errors import DiffTetError, shown
 from difftetvr.inputs import as_number, as_reals
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.recording import eager
-from difftetvr.rendering.api import render
+from difftetvr.rendering.api import RenderedImage, render
 from difftetvr.rendering.cell_features import CellFeatures, medium_of
 from difftetvr.rendering.rays import Rays, RaySource
 from difftetvr.rendering.scalar_field import ScalarField
 
 
-@eager
+@overload
 def render_shading(
     mesh: TetMesh,
     field: Field | ScalarField | CellFeatures,
@@ -27,7 +28,31 @@ def render_shading(
     ambient: float = 0.35,
     renderer: str = "marching",
     clip_plane: Sequence[float] | torch.Tensor | None = None,
-) -> torch.Tensor:
+) -> torch.Tensor: ...
+
+
+@overload
+def render_shading(
+    mesh: TetMesh,
+    field: Field | ScalarField | CellFeatures,
+    camera: Sequence[RaySource],
+    light: Sequence[float] | torch.Tensor,
+    ambient: float = 0.35,
+    renderer: str = "marching",
+    clip_plane: Sequence[float] | torch.Tensor | None = None,
+) -> torch.Tensor | tuple[torch.Tensor, ...]: ...
+
+
+@eager
+def render_shading(
+    mesh: TetMesh,
+    field: Field | ScalarField | CellFeatures,
+    camera: RaySource | Rays | Sequence[RaySource],
+    light: Sequence[float] | torch.Tensor,
+    ambient: float = 0.35,
+    renderer: str = "marching",
+    clip_plane: Sequence[float] | torch.Tensor | None = None,
+) -> torch.Tensor | tuple[torch.Tensor, ...]:
     """Gradient shading: the mean shade of what each ray sees, by which the colours of an image are multiplied.
 
     The shade of a cell is Lambert's, of both sides: ambient + (1 - ambient) abs(n . l), with the direction l to the
@@ -44,14 +69,15 @@ def render_shading(
     Args:
         mesh: The mesh, see :func:`difftetvr.render`.
         field: What is lit: densities or scalars per vertex or per cell; the latter are averaged at vertices first.
-        camera: A camera or any bundle of rays.
+        camera: A camera, any bundle of rays, or cameras.
         light: (3,) direction to the light in world space, of any length but 0.
         ambient: Shade of what faces across the light, in [0, 1].
         renderer: How crossings are found and ordered.
         clip_plane: (4,) a, b, c, d: only what lies where a x + b y + c z + d >= 0 is seen.
 
     Returns:
-        (H, W) shades in [0, 1], or (...) of the rays; 1 where a ray sees nothing.
+        (H, W) shades in [0, 1], or (...) of the rays; 1 where a ray sees nothing. Of several cameras (B, H, W), or a
+        tuple.
 
     Raises:
         MeshError: The field does not fit the mesh, or holds values that are no densities.
@@ -68,6 +94,10 @@ def render_shading(
     shade = torch.where(is_flat, 1.0, ambient + (1.0 - ambient) * cosine)
     features = CellFeatures(shade[:, None].to(mesh.vertices.dtype), medium)
     image = render(mesh, features, camera, renderer=renderer, clip_plane=clip_plane)
+    return _mean_shade(image) if isinstance(image, RenderedImage) else tuple(map(_mean_shade, image))
+
+
+def _mean_shade(image: RenderedImage) -> torch.Tensor:
     is_empty = image.alpha <= 0.0
     return torch.where(is_empty, 1.0, image.color[..., 0] / torch.where(is_empty, 1.0, image.alpha))
 
