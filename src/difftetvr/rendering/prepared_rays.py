@@ -100,7 +100,7 @@ class PreparedRays:
         ends_matter = any(needed[2:])
         return PreparedRays(
             counted,
-            _lane_order(backend, given.shape),
+            lane_order(backend, tuple(given.shape)),
             None if sees_all and not ends_matter else counted.limits,
             None if is_told or ends_matter else counted.flags,
             begins_at_point,
@@ -142,10 +142,21 @@ def _counted(given: GivenBundle, mesh: TetMesh, backend: Backend, unit: float) -
 
 
 @lru_cache(maxsize=16)
-def _lane_order(backend: Backend, shape: torch.Size) -> Any | None:
+def lane_order(backend: Backend, shape: tuple[int, ...]) -> Any | None:
     """See :func:`difftetvr.rendering.rays.image_order`, in kernels' memory."""
-    order = image_order(tuple(shape), backend.device)
+    order = image_order(shape, backend.device)
     return None if order is None else backend.uints(order)
+
+
+@lru_cache(maxsize=16)
+def lane_places(backend: Backend, shape: tuple[int, ...]) -> Any | None:
+    """Which lane has each ray, see :func:`lane_order`."""
+    order = image_order(shape, backend.device)
+    if order is None:
+        return None
+    places = torch.empty_like(order)
+    places[order.long()] = torch.arange(len(order), dtype=order.dtype, device=order.device)
+    return backend.uints(places)
 
 
 def _rows(values: torch.Tensor, device: torch.device, wide: torch.dtype) -> torch.Tensor:

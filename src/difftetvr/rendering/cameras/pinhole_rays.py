@@ -14,6 +14,7 @@ from difftetvr.rendering.traversal.rays import (
     lane_count,
     lane_pixel,
     largest_coordinate,
+    pixel_lane,
     rounding_of,
 )
 
@@ -27,9 +28,15 @@ _NEAR_PLANE = 2.0**-8  # points nearer to the camera's plane, in units of their 
 
 @dataclass
 class PinholeRays:
-    """Intrinsics and image size in memory, so that a new view needs no recompilation; see `ImageRays`."""
+    """Intrinsics and image size in memory, so that a new view needs no recompilation; see `ImageRays`.
+
+    Lanes without a pixel cost little, but threads share lanes, and not pixels. So where an image is no whole number of
+    blocks, tables tell the pixel of each lane, and the lane of each pixel.
+    """
 
     size: tuple[int, int]
+    order: Any | None
+    places: Any | None
     intrinsics: Any
     width: Any  # values of their own, not gathered ones: 0 in masked lanes, which integer division does not survive
     height: Any
@@ -38,8 +45,13 @@ class PinholeRays:
     def of(backend: Backend, camera: Camera) -> PinholeRays:
         """Upload a camera's intrinsics."""
         values = [camera.fx, camera.fy, camera.cx, camera.cy, 1.0 / camera.fx, 1.0 / camera.fy]
-        width, height = (backend.constant(pixels) for pixels in (camera.width, camera.height))
-        return PinholeRays((camera.width, camera.height), backend.Float(values), width, height)
+        from difftetvr.rendering.prepared_rays import lane_order, lane_places  # late: cameras are there without bundles
+
+        size, shape, order, places = (camera.width, camera.height), (camera.height, camera.width), None, None
+        if lane_count(*size) > camera.width * camera.height:
+            order, places = lane_order(backend, shape), lane_places(backend, shape)
+        width, height = (backend.constant(pixels) for pixels in size)
+        return PinholeRays(size, order, places, backend.Float(values), width, height)
 
     def _intrinsic(self, place: int) -> Any:
         """fx, fy, cx, cy, 1 / fx or 1 / fy."""
@@ -52,13 +64,23 @@ class PinholeRays:
 
     @property
     def lane_count(self) -> int:
-        """Number of lanes: the size rounded up to whole blocks."""
-        return lane_count(*self.size)
+        """Number of lanes: one for each pixel, or the size rounded up to whole blocks."""
+        return lane_count(*self.size) if self.order is None else self.count
 
     def of_lanes(self, lane: Any) -> Lanes:
         """Neighbouring lanes see neighbouring pixels, so rays share cells in cache."""
-        column, row, valid = lane_pixel(self, lane)
-        return Lanes(row * self.width + column, valid, self.frame(column, row))
+        if self.order is None:
+            column, row, valid = lane_pixel(self, lane)
+            return Lanes(row * self.width + column, valid, self.frame(column, row))
+        valid = lane < self.width * self.height
+        pixel = dr.gather(type(self.width), self.order, lane, valid)
+        return Lanes(pixel, valid, self.of_pixels(pixel))
+
+    def lane_of(self, column: Any, row: Any) -> Any:
+        """The lane of a pixel."""
+        if self.places is None:
+            return pixel_lane(self, column, row)
+        return dr.gather(type(self.width), self.places, row * self.width + column)
 
     def of_pixels(self, pixel: Any) -> Frame:
         """Frames of the rays of some pixels."""

@@ -10,7 +10,7 @@ import drjit as dr
 
 from difftetvr.rendering.search.hits import Hit
 from difftetvr.rendering.search.scene import NONE, Scene
-from difftetvr.rendering.traversal.rays import largest_coordinate, pixel_lane, rounding_of
+from difftetvr.rendering.traversal.rays import largest_coordinate, rounding_of
 from difftetvr.rendering.traversal.walk import Corner, crossing_depth, holds_ray, interpolate, make_face
 
 _ITEM_PIXELS = 64  # a work item has about so many pixels, at most _ITEM_ROWS rows, and at least one
@@ -154,7 +154,7 @@ def _for_each_pixel(scene: Scene, half_face: Any, box: PixelBox, visit: Callable
         depth = dr.if_stmt((face,), passes_camera, exact, simple)
         is_hit = holds_ray(face) & (~passes_camera | (depth > 0))
         pixel = row * scene.image.width + column
-        visit(Hit(pixel, pixel_lane(scene.image, column, row), half_face, depth, is_hit))
+        visit(Hit(pixel, scene.image.lane_of(column, row), half_face, depth, is_hit))
         ends = column == box.last_column
         return dr.select(ends, box.first_column, column + 1), dr.select(ends, row + 1, row)
 

@@ -107,6 +107,10 @@ class ImageRays(KernelRays, Protocol):
         """Frame of the ray of a pixel."""
         ...
 
+    def lane_of(self, column: Any, row: Any) -> Any:
+        """The lane of a pixel, the inverse of :meth:`of_lanes`."""
+        ...
+
     def pixel_range(self, backend: Backend, points: list[list[Any]]) -> tuple[tuple[Any, Any], tuple[Any, Any], Any]:
         """Pixels that may see the convex hull of some points in camera space: rather too many than too few.
 
