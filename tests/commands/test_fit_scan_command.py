@@ -81,11 +81,28 @@ def test_the_help_is_that_of_projections_where_some_are_named(there, capsys):
         (["fit", "scan.npz", "-o", "OUT", "--resume", "--cells", "500"], "cells = 400"),
         (["fit", "scan.npz", "-o", "NEW", "--total-variation", "-1"], "total_variation"),
         (["fit", "scan.npz", "-o", "NEW", "--harmonics", "2"], "harmonics"),
-        (["fit", "scan.npz", "-o", "NEW", "--holdout-every", "1"], "1th view"),
+        (
+            ["fit", "scan.npz", "-o", "NEW", "--holdout-every", "1"],
+            "holdout_every is 1: one of so many views cannot be",
+        ),
         (["fit", "scan.npz", "-o", "NEW", "--truth", "none.npy"], "none.npy"),
         (["fit", "missing.h5", "-o", "NEW"], "missing.h5"),
+        (["fit", "-o", "NEW", "--config", "OUT/config.json"], "of a run on projections"),
+        (["eval", "OUT/model.vtu"], "reconstructed from projections, and eval compares images"),
     ],
 )
 def test_what_is_refused(there, capsys, words, sentence):
     assert sentence in fails(capsys, *words)
     assert not (there / "NEW").exists()
+
+
+def test_a_truth_that_is_empty_is_refused(there, capsys):
+    np.save("empty.npy", np.zeros((4, 4, 4), np.float32))
+    assert "greater than 0 nowhere" in fails(capsys, "fit", "scan.npz", "-o", "NEW", "--truth", "empty.npy")
+
+
+def test_projections_are_described(there, capsys):
+    assert cli.main(["info", "scan.npz"]) == 0
+    said = capsys.readouterr().out
+    for text in ("training", "line integrals", "from a source", "variance"):
+        assert text in said, text

@@ -283,6 +283,45 @@ def test_pixels_that_do_not_count_say_nothing() -> None:
     assert math.isfinite(one.score.mean_psnr)
 
 
+@pytest.mark.parametrize("values", [0.0, -1.0, 1e-12])
+def test_where_nothing_absorbs_there_is_nothing_to_reconstruct(values: float) -> None:
+    geometry = ProjectionGeometry.from_dict(COARSE)
+    scan = ProjectionCapture(geometry, torch.full(geometry.shape, values))
+    with pytest.raises(FitError, match="Nothing absorbs in 'scan': its greatest line integral is"):
+        reconstruct(scan, TomographyConfig(iterations=1))
+
+
+def test_views_without_a_valid_pixel_teach_nothing() -> None:
+    geometry = ProjectionGeometry.from_dict(COARSE)
+    test = torch.arange(10) == 3
+    valid = test[:, None, None].expand(geometry.shape)
+    with pytest.raises(FitError, match="No pixel of the views of 'scan' to learn from is valid"):
+        reconstruct(ProjectionCapture(geometry, torch.ones(geometry.shape), None, valid, test), TomographyConfig())
+
+
+def test_runs_are_resumed_though_masked_pixels_are_no_numbers(tmp_path) -> None:
+    geometry = ProjectionGeometry.from_dict(COARSE)
+    values = torch.rand(geometry.shape, generator=torch.Generator().manual_seed(0))
+    valid = values > 0.1
+    scan = ProjectionCapture(geometry, torch.where(valid, values, torch.nan), None, valid)
+    config = TomographyConfig(cells=300, iterations=2, rays=100, solve_steps=0, evaluate_every=0)
+    reconstruct(scan, config, checkpoint=tmp_path / "checkpoint.npz")
+    config = dataclasses.replace(config, iterations=3)
+    resumed = reconstruct(scan, config, checkpoint=tmp_path / "checkpoint.npz", resume=True)
+    assert resumed.metrics["iterations"] == 3
+
+
+def test_shadows_that_are_cut_off_do_not_tell_the_axis() -> None:
+    """Of a detector that stands aside and sees the object in half of the views, the centres are not the object's."""
+    mesh = jittered(dtype=torch.float32)
+    density = ball(mesh)
+    aside = CONE | {"detector_size": [2.4, 4], "detector_offset": [1.0, 0.0]}
+    scan = Measurements(scan_of(mesh, density, aside), torch.device("cpu"))
+    assert scan.axis_shift() == 0.0
+    whole = Measurements(scan_of(mesh, density, CONE | {"detector_offset": [0.3, 0.0]}), torch.device("cpu"))
+    assert abs(whole.axis_shift()) < 0.5
+
+
 def test_nothing_is_put_outside_of_the_support(tmp_path) -> None:
     mesh = jittered(dtype=torch.float32)
     capture = scan_of(mesh, ball(mesh) + 0.3, PARALLEL)  # all of the box absorbs, so outside would be used

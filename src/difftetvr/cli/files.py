@@ -12,10 +12,20 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 import tyro
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
+from difftetvr.capture.projections.naming import is_projection_source
 from difftetvr.cli.arguments import Groups
-from difftetvr.cli.options import CAPTURE_GROUPS, CaptureOptions, Color, MeshOptions, TrustOptions, color_of, load_model
+from difftetvr.cli.options import (
+    CAPTURE_GROUPS,
+    CaptureOptions,
+    Color,
+    MeshOptions,
+    TrustOptions,
+    color_of,
+    load_model,
+    saying,
+)
 from difftetvr.cli.parsing import parse_if_valid
-from difftetvr.cli.saved import run_behind
+from difftetvr.cli.saved import is_of_scan, run_behind
 from difftetvr.errors import FitError
 from difftetvr.files import require_writable
 from difftetvr.fitting.records.folder import RunFolder, write_json
@@ -23,6 +33,8 @@ from difftetvr.fitting.records.folder import RunFolder, write_json
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
+
+    from difftetvr.capture.projections.projection_capture import ProjectionCapture
 
 
 @dataclass(frozen=True)
@@ -56,6 +68,11 @@ class Eval:
         from difftetvr.view.describe import evaluation_table
 
         if self.capture is None:
+            if is_of_scan(RunFolder(self.model.parent)):
+                raise FitError(
+                    f"{self.model} was reconstructed from projections, and eval compares images; metrics.json beside "
+                    "it tells its held-out views."
+                )
             raise FitError(f"No config.json of a run lies beside {self.model} and says what it fits; name CAPTURE.")
         if self.output is not None:
             require_writable(self.output, FitError)
@@ -93,10 +110,11 @@ class Eval:
 
 @dataclass(frozen=True)
 class Info:
-    """Describe a mesh or a capture."""
+    """Describe a mesh, a volume, a capture or projections."""
 
     file: Annotated[str, Positional, arg(metavar="FILE")]
-    """A mesh (.vtu, .vtk, .msh, .mesh, .xdmf, .npz, .bintet, .ovm, .node), a volume, a capture (.npz), or tooth.
+    """A mesh (.vtu, .vtk, .msh, .mesh, .xdmf, .npz, .bintet, .ovm, .node), a volume, a capture (.npz), projections
+    (.h5, .npz or a folder), or tooth.
     A volume's values are described without a --transfer-function, its views with one."""
     reading: OmitArgPrefixes[MeshOptions] = field(default_factory=MeshOptions)
     views_of: OmitArgPrefixes[CaptureOptions] = field(default_factory=CaptureOptions)
@@ -106,9 +124,13 @@ class Info:
     def run(self, console: Console) -> None:
         """Prints tables."""
         from difftetvr.capture.volumes.volume import is_volume_file
-        from difftetvr.view.describe import capture_table, data_table, mesh_tables, volume_table
+        from difftetvr.view.describe import capture_table, data_table, mesh_tables, scan_table, volume_table
 
         path = Path(self.file)
+        if is_projection_source(self.file):
+            with saying(console):
+                console.print(scan_table(self.file, _projections(self.file)))
+            return
         if is_volume_file(path) and self.views_of.transfer_function is None:
             console.print(volume_table(self.file, self.views_of.summarise(self.file, console)))
             return
@@ -126,6 +148,12 @@ class Info:
             console.print(table_of_data)
         if (table_of_run := _run_of(path)) is not None:
             console.print(table_of_run)
+
+
+def _projections(source: str) -> ProjectionCapture:
+    from difftetvr.capture.projections.projection_capture import ProjectionCapture
+
+    return ProjectionCapture.load(source)
 
 
 def _run_of(path: Path) -> Table | None:

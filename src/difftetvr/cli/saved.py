@@ -64,6 +64,11 @@ class SavedRun:
         if path.is_dir():
             raise FitError(f"--config cannot use {path}: It is a folder; give a file, such as {path / 'config.json'}.")
         require_regular(path, FitError)
+        folder = RunFolder(path.parent)
+        if path.name == folder.config.name and is_of_scan(folder):
+            raise FitError(
+                f"--config cannot use {path}: It is of a run on projections, whose options are given by name."
+            )
         return _read(path, SavedRun, _LEFT_OPEN, f"--config cannot use {path}")
 
 
@@ -106,7 +111,19 @@ def goes_on_with(options: str, args: Sequence[str]) -> bool:
     """
     try:
         folder = folder_to_resume(args)
-        return folder is not None and options in json.loads(folder.config.read_bytes())
+    except (OSError, ValueError, TypeError):
+        return False
+    return folder is not None and _has_options(folder, options)
+
+
+def is_of_scan(folder: RunFolder) -> bool:
+    """Whether a folder holds a run that reconstructed from projections."""
+    return _has_options(folder, "tomography")
+
+
+def _has_options(folder: RunFolder, options: str) -> bool:
+    try:
+        return options in json.loads(folder.config.read_bytes())
     except (OSError, ValueError, TypeError, RecursionError):
         return False  # What is wrong with the file is said when it is read.
 

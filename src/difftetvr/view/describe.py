@@ -15,6 +15,7 @@ from rich.text import Text
 from difftetvr.capture.capture import Capture
 from difftetvr.capture.degenerate import why_degenerate
 from difftetvr.capture.packed import Masks
+from difftetvr.capture.projections.projection_capture import ProjectionCapture
 from difftetvr.capture.volumes.summary import VolumeSummary
 from difftetvr.capture.volumes.value_range import range_text
 from difftetvr.errors import counted
@@ -164,6 +165,27 @@ def capture_table(name: str, capture: Capture) -> Table:
     if (reason := why_degenerate(capture)) is not None:
         table.add_row("degenerate", reason)
     table.add_row("density unit", f"{capture.density_unit:g} per unit length")
+    return table
+
+
+def scan_table(name: str, scan: ProjectionCapture) -> Table:
+    """Number and size of the views, geometry and line integrals of projections."""
+    geometry, values = scan.geometry, scan.line_integrals
+    views, height, width = geometry.shape
+    lower, upper = geometry.bounds.tolist()
+    unit = "" if geometry.unit is None else f" {geometry.unit}"
+    table = _table(name)
+    table.add_row("views", f"{views} ({len(scan.train_indices)} training, {len(scan.test_indices)} held out)")
+    table.add_row("pixels", f"{width} x {height}")
+    table.add_row("rays", "parallel" if geometry.detector.source is None else "from a source")
+    if geometry.angles is not None:
+        table.add_row("angles", f"{range_text((float(geometry.angles.min()), float(geometry.angles.max())))} degrees")
+    table.add_row("box", f"{_point(lower)} to {_point(upper)}{unit}")
+    known = values if scan.valid is None else values[scan.valid]
+    table.add_row("line integrals", range_text((float(known.min()), float(known.max()))))
+    table.add_row("variance", "estimated" if scan.variance is None else "known")
+    if scan.valid is not None:
+        table.add_row("left out", f"{100.0 * (1.0 - len(known) / values.numel()):.2g} % of the pixels")
     return table
 
 

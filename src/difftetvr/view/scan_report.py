@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 from difftetvr.capture.volumes.voxels import load_volume
-from difftetvr.errors import CaptureWarning
+from difftetvr.errors import CaptureError, CaptureWarning
 from difftetvr.fitting.metrics import psnr_of_mse
 from difftetvr.fitting.records.folder import RunFolder, write_json
 from difftetvr.inverse.tomography.loop import TomographyResult
@@ -44,11 +44,14 @@ def read_truth(path: Path) -> Truth:
     """The volume to compare with.
 
     Raises:
-        CaptureError: It cannot be read.
+        CaptureError: It cannot be read, or holds nothing.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CaptureWarning)
-        return Truth(load_volume(path).values.float())
+        values = load_volume(path).values.float()
+    if not float(values.max()) > 0.0:
+        raise CaptureError(f"'{path}' is greater than 0 nowhere, so nothing can be compared with it; leave it out.")
+    return Truth(values)
 
 
 def write_scan_report(
@@ -75,7 +78,8 @@ def write_scan_report(
     save_picture(folder.cut, _slices(result, scan, truth))
     save_picture(folder.comparison, _views(result, scan))
     compared = {} if truth is None else {"volume_psnr": volume_psnr(result, scan, truth)}
-    write_json(folder.metrics, {"capture": scan.capture.name, **result.metrics, **compared})
+    unit = {"unit_of_length": scan.capture.geometry.unit}
+    write_json(folder.metrics, {"capture": scan.capture.name, **unit, **result.metrics, **compared})
     return compared
 
 

@@ -1,5 +1,6 @@
 """What projections say of themselves: counts that become line integrals, their noise, views that are held out."""
 
+import json
 import warnings
 
 import numpy as np
@@ -50,6 +51,32 @@ def test_the_variance_is_that_of_many_measurements():
     # One flat field for all views is the same error everywhere, so that the spread is that of the views.
     assert float(capture.line_integrals.var()) == pytest.approx(views / views**2 + sigma**2 / views**2, rel=0.1)
     assert float(capture.line_integrals.mean()) == pytest.approx(np.log(flat / views), abs=0.005)
+
+
+def test_masks_of_another_shape_are_refused_with_counts_too(tmp_path):
+    counts = 1e3 * np.exp(-TRUE.numpy())
+    text = json.dumps(GEOMETRY.to_dict())
+    for shape in ((5, 6), (5, 6, 4), (4, 5)):
+        for kind, array in (("intensities", counts), ("line_integrals", TRUE.numpy())):
+            for valid in (np.ones(shape, bool), np.zeros(shape, bool)):
+                np.savez(tmp_path / "scan.npz", geometry=text, flat=1e3, valid=valid, **{kind: array})
+                with pytest.raises(CaptureError, match=r"mask 'valid' of 'scan' is .* pass bool of shape \(4, 5, 6\)"):
+                    ProjectionCapture.load(tmp_path / "scan.npz")
+
+
+def test_transmissions_have_the_noise_that_is_seen():
+    """They are no photons: a variance of one over each would be ten thousand times too great."""
+    geometry = ProjectionGeometry.from_dict(
+        {"type": "parallel", "views": 6, "detector": [40, 30], "detector_size": [2, 2]}
+    )
+    smooth = np.linspace(0.0, 1.0, 40)[None, None] * np.ones((6, 30, 40))
+    counts = np.random.default_rng(3).poisson(1e4 * np.exp(-smooth)).astype(np.float64)
+    photons = ProjectionCapture.from_intensities(geometry, counts, 1e4)
+    with pytest.warns(CaptureWarning, match="times that of one photon for each count"):
+        relative = ProjectionCapture.from_intensities(geometry, counts / 1e4, 1.0)
+    torch.testing.assert_close(relative.line_integrals, photons.line_integrals)
+    # That of the views: one flat field is the same error everywhere, of which no pixel knows.
+    assert float(relative.variance.mean()) == pytest.approx(float((1.0 / counts).mean()), rel=0.15)
 
 
 def test_dead_pixels_and_those_that_count_nothing_are_left_out_and_counted():

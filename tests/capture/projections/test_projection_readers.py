@@ -164,12 +164,39 @@ def test_data_exchange_of_synchrotrons(tmp_path):
     np.testing.assert_allclose(pixel, -1.0 * np.array([-np.sin(turned), np.cos(turned), 0]), atol=1e-12)
 
 
+def test_sinograms_by_hand_may_have_masks_of_two_axes(tmp_path):
+    text = json.dumps(
+        {
+            "type": "fan",
+            "views": 3,
+            "source_distance": 5,
+            "detector_distance": 7,
+            "detector": 6,
+            "detector_size": 4,
+            "volume_size": 2,
+        }
+    )
+    valid = np.ones((3, 6), bool)
+    valid[1, 2] = False
+    np.savez(
+        tmp_path / "slice.npz", geometry=text, line_integrals=np.ones((3, 6)), variance=np.ones((3, 6)), valid=valid
+    )
+    loaded = ProjectionCapture.load(tmp_path / "slice.npz")
+    assert loaded.valid.shape == (3, 1, 6) and not loaded.valid[1, 0, 2] and loaded.variance.shape == (3, 1, 6)
+
+
 def test_what_data_exchange_leaves_out_is_assumed_and_said(tmp_path):
     with pytest.warns(CaptureWarning) as caught:
         capture = ProjectionCapture.load(exchange(tmp_path / "a.h5", theta=None, data_dark=None))
     said = " ".join(str(warning.message) for warning in caught)
     assert "taken as 0" in said and "evenly over 180 degrees" in said and "3 pixels from the left edge" in said
     assert capture.geometry.angles.tolist() == pytest.approx([0, 60, 120]) and capture.geometry.unit is None
+
+
+def test_angles_without_a_unit_that_could_be_radians_are_told_of(tmp_path):
+    path = exchange(tmp_path / "a.h5", theta=np.array([0.0, 1.05, 2.1]))
+    with pytest.warns(CaptureWarning, match="have no unit and span 2.1; they are taken as degrees"):
+        assert ProjectionCapture.load(path, center=3).geometry.angles.tolist() == pytest.approx([0, 1.05, 2.1])
 
 
 @pytest.mark.parametrize(

@@ -44,6 +44,7 @@ def judgement(capture: Capture, mesh: TetMesh) -> Judgement:
 def test_all_pixels_of_a_view_are_its_image(capture: Capture) -> None:
     every = JudgedPixels.of(truth_of(capture), 2, BACKGROUND)
     assert every.count == 24 * 20
+    every = every.in_a_row
     directions = capture.cameras[2].rays().directions.reshape(-1, 3)
     places = [int((directions == direction).all(1).nonzero()[0]) for direction in every.rays.directions[0]]
     assert sorted(places) == list(range(24 * 20))
@@ -56,7 +57,7 @@ def test_chosen_pixels_are_different_and_spread(capture: Capture, count: int, be
     every = JudgedPixels.of(truth_of(capture), 2, BACKGROUND)
     some = every.spread(count, begin)
     assert some.count == min(count, every.count)
-    assert len(torch.unique(some.rays.directions[0], dim=0)) == some.count
+    assert len(torch.unique(some.in_a_row.rays.directions[0], dim=0)) == some.count
 
 
 def test_models_are_means_over_the_views(

@@ -5,12 +5,14 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 
-from difftetvr.capture.projections.noise import log_variance
+from difftetvr.capture.projections.noise import estimated_noise, log_variance
 from difftetvr.errors import CaptureError, counted, shown
 
 _GREATEST = 1e30  # count, so that squares of counts are numbers
 _LEAST_TRANSMISSION = 1e-15  # of what is taken for light, and not for rounding
+_LEAST_UNITS, _FEWEST_UNITS = 0.05, 1e-3  # noise in units of that of photons: with less, counts are none; at least
 
 
 class Absorbed(NamedTuple):
@@ -34,7 +36,8 @@ def absorbed(intensities: np.ndarray, flat: Any, dark: Any, sigma: float, name: 
 
     Pixels that are dead, those whose flat field is not brighter than the dark one, are not valid in any view; those
     that count nothing, or something else than a finite number, not in that view. The noise is that of photons, one for
-    each count, of the view and of the mean of the flat and the dark frames, and of the electronics.
+    each count, of the view and of the mean of the flat and the dark frames, and of the electronics. Where there is far
+    less of it, counts are not photons, and variances are those of the noise that there is.
 
     Args:
         intensities: (V, H, W) counts.
@@ -69,7 +72,23 @@ def absorbed(intensities: np.ndarray, flat: Any, dark: Any, sigma: float, name: 
     if not valid.any():
         raise CaptureError(f"No pixel of '{name}' counts more than its dark field; check which arrays are which.")
     line_integrals[~valid] = line_integrals[valid].max()
-    return Absorbed(line_integrals, variance, valid, tuple(_notes(dead, valid, name)))
+    notes = _notes(dead, valid, name)
+    units = _noise_in_units(line_integrals, variance, valid)
+    if units is not None and units < _LEAST_UNITS:
+        # Photons make more noise, also where a detector spreads them over neighbours and differences miss some of it.
+        variance *= max(units, _FEWEST_UNITS) ** 2
+        notes.append(
+            f"The noise of '{name}' is {units:.2g} times that of one photon for each count, as of transmissions or "
+            "averages; variances are taken so much smaller."
+        )
+    return Absorbed(line_integrals, variance, valid, tuple(notes))
+
+
+def _noise_in_units(line_integrals: np.ndarray, variance: np.ndarray, valid: np.ndarray) -> float | None:
+    """Noise of line integrals in standard deviations of its model; None where it cannot be told."""
+    known = torch.from_numpy(np.where(valid, line_integrals, np.nan))
+    found = estimated_noise(known, torch.from_numpy(variance))
+    return found if found is None or found > 0.0 else None
 
 
 def _notes(dead: np.ndarray, valid: np.ndarray, name: str) -> list[str]:

@@ -15,6 +15,9 @@ from difftetvr.errors import CaptureError, shown
 _LEAST_COUNT = 0.5  # where noise leaves none, as between none and one photon
 _AT_ONCE = 2**22
 _MOST_COUNTS = 1e15
+_ROBUST = 1.4826  # of a normal distribution, the standard deviation in medians of magnitudes
+_SAMPLE = 1_000_000
+_LEAST_SIDE = 3
 _WORDS = (
     "give it as 'poisson:1e4,gaussian:10', with 'scale:1' behind it for counts that do not depend on the largest one"
 )
@@ -129,6 +132,39 @@ class NoisyProjections:
     line_integrals: torch.Tensor
     variance: torch.Tensor | None
     valid: torch.Tensor
+
+
+def estimated_noise(values: torch.Tensor, variance: torch.Tensor | None = None) -> float | None:
+    """Standard deviation of noise that is the same in all pixels, or that a model knows up to a factor.
+
+    It shows in second differences. What these leave of the object itself is at edges; the median passes over them.
+
+    Source: Immerkaer, "Fast noise variance estimation" (1996).
+
+    Args:
+        values: (V, H, W) images; NaN where a pixel is not known.
+        variance: (V, H, W) by the model; None for 1.
+
+    Returns:
+        In units of that of the model; None where too few pixels lie side by side.
+    """
+    axes = [axis for axis in (1, 2) if values.shape[axis] >= _LEAST_SIDE]
+    if 2 not in axes:
+        return None
+    expected = torch.ones_like(values) if variance is None else variance
+    for axis in axes:
+        values, expected = _stencil(values, axis, -2.0), _stencil(expected, axis, 4.0)
+    known = torch.isfinite(values)
+    ratios = values[known].abs() / expected[known].sqrt()
+    sample = ratios[:: max(1, len(ratios) // _SAMPLE)]
+    return _ROBUST * float(sample.median()) if len(sample) else None
+
+
+def _stencil(values: torch.Tensor, axis: int, middle: float) -> torch.Tensor:
+    """Sums of three neighbours along an axis, the middle one weighed."""
+    count = values.shape[axis] - 2
+    first, second, third = (values.narrow(axis, start, count) for start in range(3))
+    return first + middle * second + third
 
 
 def log_variance(counts: NDArray[np.float64], sigma: float = 0.0) -> NDArray[np.float64]:

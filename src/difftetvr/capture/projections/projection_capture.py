@@ -110,7 +110,8 @@ class ProjectionCapture:
 
         Pixels that count nothing, and those that are dead, are not valid, which a warning counts. The variance is that
         of photons, one for each count, and of the electronics; where a count is several photons or a part of one, it
-        is so in all pixels, and only the proportions of the variances are right.
+        is so in all pixels, and only the proportions of the variances are right, unless the noise is less than a
+        twentieth of that of photons: then they are made to fit it, with a warning.
 
         Args:
             geometry: Of the V views.
@@ -125,7 +126,7 @@ class ProjectionCapture:
             CaptureError: Shapes do not fit, no pixel tells anything, or as for the class.
 
         Warns:
-            CaptureWarning: Pixels are left out.
+            CaptureWarning: Pixels are left out, or counts are no photons.
         """
         raw = RawScan(geometry, intensities=_array(counts, "counts"), flat=flat, dark=dark)
         return _captured(raw, name, gaussian, test)
@@ -172,7 +173,10 @@ class ProjectionCapture:
         if every is None or every == 0:
             return torch.zeros(views, dtype=torch.bool)
         if isinstance(every, bool) or not isinstance(every, int) or not 2 <= every <= views:
-            raise CaptureError(f"Every {shown(every)}th view cannot be held out of {views}; give 0, or 2 to {views}.")
+            least = f", or 2 to {views}" if views > 1 else ""
+            raise CaptureError(
+                f"holdout_every is {shown(every)}: one of so many views cannot be held out of {views}; give 0{least}."
+            )
         return torch.arange(views) % every == every // 2
 
     def save(self, path: str | Path) -> None:
@@ -230,10 +234,12 @@ def _captured(raw: RawScan, name: str, sigma: float, test: torch.Tensor | None) 
             )
         found = absorbed(counts, raw.flat, raw.dark, sigma, name)
         notes, values, variance = (*notes, *found.notes), found.line_integrals, found.variance
-        valid = found.valid if valid is None or valid.shape != found.valid.shape else found.valid & (valid != 0)
+        if valid is None or valid.shape == found.valid.shape:  # others are refused as all masks of another shape
+            valid = found.valid if valid is None else found.valid & (valid != 0)
+    values = _array(values, "line_integrals")
     for note in notes:
         warnings.warn(note, CaptureWarning, stacklevel=3)
-    everywhere = valid is None or bool(np.all(valid))
+    everywhere = valid is None or (valid.shape == raw.geometry.shape and bool(np.all(valid)))
     return ProjectionCapture(
         raw.geometry,
         torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32)),

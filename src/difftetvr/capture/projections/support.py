@@ -38,7 +38,7 @@ class OutsideSupport:
             device: Where places are that are asked for.
 
         Raises:
-            CaptureError: The volume cannot be read, or the z axis is not in the box.
+            CaptureError: The volume cannot be read or has one value everywhere, or the z axis is not in the box.
         """
         if support == CYLINDER:
             low, high = geometry.bounds[:, :2]
@@ -50,7 +50,10 @@ class OutsideSupport:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", CaptureWarning)
             values = Volume.load(support).values
-        return OutsideSupport(geometry.bounds.to(device), torch.from_numpy(values > 0).permute(2, 1, 0).to(device))
+        inside = torch.from_numpy(values > values.min())
+        if not bool(inside.any()):
+            raise CaptureError(f"'{support}' has one value everywhere, so it tells no support; leave it out.")
+        return OutsideSupport(geometry.bounds.to(device), inside.permute(2, 1, 0).to(device))
 
     def contains(self, places: torch.Tensor) -> torch.Tensor:
         """(N,) bool, which of (N, 3) places are outside of the support."""

@@ -70,6 +70,10 @@ class Voxelise:
         data = self.reading.load(self.model, console)
         job = Job(self.model, self.output, () if self.scalar is None else (self.scalar,), data, console)
         options.write_sampled(job, scalars_of(job), *self._grids(job), x_first=True)
+        if self.output.suffix.lower() == ".npy":
+            job.say(
+                f"{self.output} has the axes x, y, z; to be read as a volume, an array needs z, y, x, or be a .nrrd."
+            )
 
     def _grids(self, job: Job) -> tuple[Grid, Grid]:
         """Where to sample in the mesh's world, and what the file says of that."""

@@ -29,13 +29,16 @@ if TYPE_CHECKING:
     from difftetvr.inverse.tomography.loop import TomographyResult
     from difftetvr.inverse.tomography.reconstruction import Reconstruction
 
+_HELD_OUT_EVERY = 10
+
 
 @dataclass(frozen=True)
 class ScanReading:
     """How projections are read."""
 
-    holdout_every: int = 10
-    """One of so many views is held out, besides those that the file holds out; 0: none."""
+    holdout_every: int | None = None
+    """One of so many views is held out, besides those that the file holds out; 0: none. Default: 10, of fewer views
+    none."""
     geometry: str | None = None
     """File with the geometry of a .npy; default: the .json of the same name."""
     center: float | None = None
@@ -56,7 +59,12 @@ class ScanReading:
         from difftetvr.capture.projections.projection_capture import ProjectionCapture
 
         options = dataclasses.asdict(self)
-        return ProjectionCapture.load(path, options.pop("holdout_every") or None, **options)
+        every = options.pop("holdout_every")
+        capture = ProjectionCapture.load(path, every, **options)
+        if every is not None or capture.geometry.num_views < _HELD_OUT_EVERY:
+            return capture
+        held_out = ProjectionCapture.held_out(_HELD_OUT_EVERY, capture.geometry.num_views)
+        return dataclasses.replace(capture, test=capture.test | held_out)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from difftetvr.capture.truth import Color, Truth, counted_share
 from difftetvr.fitting.processes import ALONE, Processes
 from difftetvr.mesh.field import Field
 from difftetvr.mesh.tetmesh import TetMesh
-from difftetvr.rendering import Rays, ScalarField, render
+from difftetvr.rendering import Camera, Rays, ScalarField, render
 from difftetvr.rendering.gauss_newton import ImageModel, model_image
 from difftetvr.rendering.rays import image_order
 
@@ -22,25 +22,23 @@ _CROSSINGS = 400.0
 """How often a cell is crossed, on average, by the rays of all pixels; a ray crosses about as many cells as the mesh has
 along one of its sides. On the Tooth at 20 k cells 40 cost 2 dB, 160 cost 0.3 dB of what 270 give: all pixels there."""
 
-_BUNDLES_A_GLANCE = 4
-"""Bundles of a share for each that a look at the error takes."""
-_PIXELS_A_GLANCE = 8
-"""Pixels for each that it takes."""
+_LOOKED_AT = 8
+"""Pixels for each that a look at the error takes."""
 
 
 @dataclass(frozen=True)
 class JudgedPixels:
-    """Pixels of views, as one image of a single row.
+    """All pixels of a view, or pixels of some views as one image of a single row.
 
     Attributes:
-        rays: (1, N) their rays.
-        truth: (1, N, 3) what they should be.
-        valid: (1, N) bool, those that count; None: all.
+        rays: The view's camera, whose entries are found sooner than those of its rays; or (1, N) rays.
+        truth: (H, W, 3) what the pixels should be, with H 1 for rays.
+        valid: (H, W) bool, those that count; None: all.
         background: Linear RGB behind the volume.
         views: Views that they are of.
     """
 
-    rays: Rays
+    rays: Camera | Rays
     truth: torch.Tensor
     valid: torch.Tensor | None
     background: Color
@@ -48,26 +46,35 @@ class JudgedPixels:
 
     @staticmethod
     def of(truth: Truth, view: int, background: Color) -> JudgedPixels:
-        """All pixels of a view, in an order in which neighbours see neighbouring cells."""
-        image, rays, valid = truth.image(view, background), truth.rays(view), truth.valid(view)
-        parts = [part.expand(*image.shape).reshape(1, -1, 3) for part in (rays.origins, rays.directions, image)]
-        pixels = JudgedPixels(Rays(*parts[:2]), parts[2], None if valid is None else valid.reshape(1, -1), background)
-        order = image_order(tuple(image.shape[:2]), image.device)
-        return pixels if order is None else pixels._at(order.long())
+        """All pixels of a view."""
+        return JudgedPixels(truth.camera(view), truth.image(view, background), truth.valid(view), background)
 
     @property
     def count(self) -> int:
-        """Number N of the pixels."""
-        return self.truth.shape[1]
+        """Number of the pixels."""
+        return self.truth.shape[0] * self.truth.shape[1]
+
+    @property
+    def in_a_row(self) -> JudgedPixels:
+        """The same as rays, in an order in which neighbours see neighbouring cells."""
+        if isinstance(self.rays, Rays):
+            return self
+        rays = self.rays.with_pose(self.rays.world_to_camera.to(self.truth.device)).rays()
+        parts = [part.expand(*self.truth.shape).reshape(1, -1, 3) for part in (rays.origins, rays.directions)]
+        truth, valid = self.truth.reshape(1, -1, 3), None if self.valid is None else self.valid.reshape(1, -1)
+        pixels = replace(self, rays=Rays(*parts), truth=truth, valid=valid)
+        order = image_order(tuple(self.truth.shape[:2]), truth.device)
+        return pixels if order is None else pixels._at(order.long())
 
     def spread(self, count: int, begin: float) -> JudgedPixels:
         """About as many as are asked for, in equal steps along their order; ``begin`` is in parts of a step."""
         if count >= self.count:
             return self
         steps = torch.arange(count, dtype=torch.float64, device=self.truth.device)
-        return self._at(((steps + begin) * (self.count / count)).long())
+        return self.in_a_row._at(((steps + begin) * (self.count / count)).long())
 
     def _at(self, places: torch.Tensor) -> JudgedPixels:
+        assert isinstance(self.rays, Rays)
         rays = Rays(self.rays.origins[:, places], self.rays.directions[:, places])
         valid = None if self.valid is None else self.valid[:, places]
         return replace(self, rays=rays, truth=self.truth[:, places], valid=valid)
@@ -151,12 +158,11 @@ class Judgement:
         return replace(self, shares=[[_joined(share)] for share in self.shares])
 
     def some(self) -> Judgement:
-        """An eighth of the pixels, out of few bundles: enough to see what became of the error."""
-        few = []
-        for share in self.shares:
-            chosen = share[::_BUNDLES_A_GLANCE]  # what a rendering costs at least is most of what few pixels cost
-            part_of_each = len(share) / (_PIXELS_A_GLANCE * len(chosen))
-            few.append([part.spread(max(1, round(part_of_each * part.count)), 0.5) for part in chosen])
+        """An eighth of the pixels, of bundles or of all views: enough to see what became of the error."""
+        few = [
+            share[::_LOOKED_AT] if len(share) > 1 else [p.spread(max(1, p.count // _LOOKED_AT), 0.5) for p in share]
+            for share in self.shares
+        ]
         views = self.processes.sum(float(sum(part.views for share in few for part in share)))
         return replace(self, shares=few, views=round(views))
 
@@ -182,7 +188,8 @@ class Judgement:
 
 
 def _joined(parts: list[JudgedPixels]) -> JudgedPixels:
-    rays, masks = [part.rays for part in parts], [part.valid for part in parts if part.valid is not None]
-    origins, directions = (torch.cat([getattr(r, name) for r in rays], 1) for name in ("origins", "directions"))
+    parts = [part.in_a_row for part in parts]
+    masks = [part.valid for part in parts if part.valid is not None]
+    origins, directions = (torch.cat([getattr(p.rays, name) for p in parts], 1) for name in ("origins", "directions"))
     truth, valid = torch.cat([part.truth for part in parts], 1), torch.cat(masks, 1) if masks else None
     return JudgedPixels(Rays(origins, directions), truth, valid, parts[0].background, sum(part.views for part in parts))

@@ -68,7 +68,7 @@ class TomographyConfig(Schedule):
     """Rays per step, at most: pixels of each view in equal steps, beginning with another one each time."""
     likelihood: Likelihood = "gaussian"
     """How residuals count: squared and weighed by the variance of each line integral where the scan tells one
-    (gaussian), by the counts that they stand for (poisson), or by their magnitudes (l1)."""
+    (gaussian), by as many counts as one over the variance (poisson), or by their magnitudes (l1)."""
     total_variation: float = 0.02
     """Weight of the total variation of the density, in units in which noise and total variation are about 1."""
     tikhonov: float = 0.0

@@ -9,7 +9,9 @@ from dataclasses import dataclass
 import torch
 
 from difftetvr.capture.projections.geometry import ProjectionGeometry
+from difftetvr.capture.projections.noise import estimated_noise
 from difftetvr.capture.projections.projection_capture import ProjectionCapture
+from difftetvr.errors import FitError
 from difftetvr.inverse.tomography.alignment import Alignment
 from difftetvr.mesh.field import Field
 from difftetvr.mesh.tetmesh import TetMesh
@@ -19,9 +21,9 @@ from difftetvr.rendering.cameras.pinhole import Camera
 
 _SQUARE = 1e-9  # cosine up to which rows and columns of a detector count as perpendicular
 _LEAST_NOISE = 1e-4  # of the greatest line integral: where noise is estimated and there is next to none
-_ROBUST = 1.4826  # of a normal distribution, the standard deviation in medians of magnitudes
-_LAPLACIAN = 6.0  # root of the sum of the squares of the second differences' weights, 1 -2 1 by 1 -2 1
-_LEAST, _SAMPLE = 1e-30, 1_000_000
+_LEAST = 1e-30
+_LEAST_PEAK = 1e-9  # line integral: whoever measures less has measured noise
+_CUT_OFF = 0.05  # at a detector's edge, of the greatest shadow: what is cut off has no centre
 _LEAST_SINE = 8
 _UNIT_RAYS = 16_384
 
@@ -58,18 +60,28 @@ class Measurements:
     """
 
     def __init__(self, capture: ProjectionCapture, device: torch.device) -> None:
-        """Brings a scan to a device."""
+        """Brings a scan to a device.
+
+        Raises:
+            FitError: Nothing absorbs, or there is no valid pixel to learn from.
+        """
         self.capture, self.device = capture, device
         self.train: list[int] = capture.train_indices.tolist()
         self.test: list[int] = capture.test_indices.tolist()
         self._is_before_detector = box_is_before_detector(capture.geometry)
         self._measured = capture.line_integrals.to(device)
+        valid = torch.ones_like(self._measured, dtype=torch.bool) if capture.valid is None else capture.valid.to(device)
+        self._measured = torch.where(valid, self._measured, 0.0)
+        self.peak = float(self._measured.max())
+        if self.peak < _LEAST_PEAK:
+            raise FitError(
+                f"Nothing absorbs in '{capture.name}': its greatest line integral is {self.peak:.3g}; check its sign, "
+                "its flat field, and whether rays meet the object."
+            )
         weight = 1.0 / capture.variance if capture.variance is not None else self._estimated_weight()
-        if capture.valid is not None:
-            weight = torch.where(capture.valid, weight, 0.0)
-            self._measured = torch.where(capture.valid.to(device), self._measured, 0.0)
-        self._weight = weight.to(device)
-        self.peak = float(torch.where(self._weight > 0, self._measured, -math.inf).max())
+        self._weight = torch.where(valid, weight.to(device), 0.0)
+        if not bool((self._weight[self.train] > 0).any()):
+            raise FitError(f"No pixel of the views of '{capture.name}' to learn from is valid; check the mask.")
         self.density_unit = self._mean_density()
 
     @property
@@ -110,7 +122,7 @@ class Measurements:
 
         The centre of what a parallel view absorbs swings around the axis as a sine of the angle (the first moment of
         Helgason and Ludwig's conditions), and nearly so that of a cone beam. 0 where angles are not known, or are fewer
-        than tell a sine.
+        than tell a sine, or the detector sees but a part of the object.
         """
         angles = self.capture.geometry.angles
         views = [view for view in self.train if bool((self._weight[view] > 0).any())]
@@ -119,6 +131,9 @@ class Measurements:
         width = self._measured.shape[2]
         seen = torch.where(self._weight[views] > 0, self._measured[views], 0.0).clamp(min=0.0).double().sum(1).cpu()
         place = torch.arange(width, dtype=torch.float64) + 0.5 - 0.5 * width
+        edges = seen[:, [0, -1]].amax(1) / seen.amax(1).clamp(min=_LEAST)
+        if float(edges.median()) > _CUT_OFF:
+            return 0.0
         mass = seen.sum(1)
         centers = (seen * place).sum(1) / mass.clamp(min=_LEAST) - axis_places(self.capture.geometry.detector)[views]
         turns = torch.deg2rad(angles[views])
@@ -127,25 +142,13 @@ class Measurements:
         return -float(fitted) if bool((mass > 0).all()) else 0.0
 
     def _estimated_weight(self) -> torch.Tensor:
-        """(V, H, W) one over the variance of noise that is the same everywhere, by second differences (Immerkaer 1996).
-
-        What they leave of the object itself is at edges; the median passes over these.
-        """
+        """(V, H, W) one over the variance of noise that is the same everywhere; without any, of little noise."""
         values, valid = self.capture.line_integrals, self.capture.valid
         if valid is not None:
             values = torch.where(valid, values, torch.nan)
         largest = float(values.abs().nan_to_num(0.0).max())
-        if min(values.shape[1:]) >= 3:
-            rows = values[:, :-2] - 2.0 * values[:, 1:-1] + values[:, 2:]
-            differences, scale = rows[..., :-2] - 2.0 * rows[..., 1:-1] + rows[..., 2:], _LAPLACIAN
-        elif values.shape[2] >= 3:
-            differences, scale = values[..., :-2] - 2.0 * values[..., 1:-1] + values[..., 2:], math.sqrt(_LAPLACIAN)
-        else:
-            return torch.full_like(values, 1.0 / max(largest, _LEAST) ** 2)
-        known = differences[torch.isfinite(differences)]
-        sample = known[:: max(1, len(known) // _SAMPLE)].abs()
-        noise = _ROBUST * float(sample.median()) / scale if len(sample) else 0.0
-        noise = max(noise, _LEAST_NOISE * largest, _LEAST)
+        noise = estimated_noise(values)
+        noise = largest if noise is None else max(noise, _LEAST_NOISE * largest)
         return torch.full_like(values, 1.0 / noise**2)
 
     def _mean_density(self) -> float:

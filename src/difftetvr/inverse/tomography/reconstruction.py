@@ -263,10 +263,11 @@ def _grid(capture: ProjectionCapture, config: TomographyConfig, strategy: Strate
 def _describe(capture: ProjectionCapture) -> dict[str, Any]:
     """What tells one scan from another: values that are compared when a run is resumed."""
     views, height, width = capture.geometry.shape
+    known = capture.line_integrals if capture.valid is None else capture.line_integrals[capture.valid]
     return {
         "views": views,
         "height": height,
         "width": width,
         "test_views": capture.test_indices.tolist(),
-        "mean": float(capture.line_integrals.mean(dtype=torch.float64)),
+        "mean": float(known.mean(dtype=torch.float64)),
     }

@@ -18,6 +18,7 @@ from difftetvr.errors import CaptureError
 from difftetvr.mesh.io.hdf5 import PlainFile
 
 PROJECTIONS = "exchange/data"
+_TURN = 6.5  # a full turn in radians, and a bit: who has fewer degrees has hardly a scan
 _THETA, _FLAT, _DARK = "exchange/theta", "exchange/data_white", "exchange/data_dark"
 
 
@@ -65,4 +66,12 @@ def _angles(path: Path, file: PlainFile, views: int, notes: list[str]) -> np.nda
     theta = file.array(_THETA).astype(np.float64).reshape(-1)
     if len(theta) != views or not np.isfinite(theta).all():
         raise CaptureError(f"'{path}' has {len(theta)} angles for {views} views; it needs a finite one for each.")
-    return theta if file.unit_of(_THETA).lower().startswith("rad") else np.deg2rad(theta)
+    unit = file.unit_of(_THETA).lower()
+    if unit.startswith("rad"):
+        return theta
+    if not unit and views > 1 and np.ptp(theta) < _TURN:
+        notes.append(
+            f"The angles of '{path}' have no unit and span {np.ptp(theta):.3g}; they are taken as degrees, as Data "
+            f"Exchange has them; for radians give '{_THETA}' the attribute units = 'rad'."
+        )
+    return np.deg2rad(theta)

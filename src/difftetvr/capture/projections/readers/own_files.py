@@ -69,8 +69,9 @@ def _scan(path: Path, geometry: str, arrays: dict[str, Any]) -> RawScan:
     if values == ["intensities"] and "flat" not in arrays:
         raise CaptureError(f"'{path}' has intensities without 'flat', what pixels count without an object; add it.")
     for name in values:
-        if arrays[name].ndim == 2:
-            arrays[name] = arrays[name][:, None]  # of a single row
+        if arrays[name].ndim == 2:  # of a single row
+            rows = [key for key in (name, "variance", "valid") if key in arrays and arrays[key].ndim == 2]
+            arrays |= {key: arrays[key][:, None] for key in rows}
     source = f"The geometry of '{path}'"
     parts = parse_parts(parse_json(geometry, source), source)
     return RawScan(geometry_of(parts, path), **arrays)
