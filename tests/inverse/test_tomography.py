@@ -328,7 +328,8 @@ def test_nothing_is_put_outside_of_the_support(tmp_path) -> None:
     inside = np.zeros((8, 8, 8), np.uint8)
     inside[2:, 2:6, :4] = 255  # z, y, x
     np.save(tmp_path / "inside.npy", inside)
-    for support in ("cylinder", str(tmp_path / "inside.npy")):
+    np.save(tmp_path / "labels.npy", np.where(inside, 2, 1).astype(np.uint8))
+    for support in ("cylinder", str(tmp_path / "inside.npy"), str(tmp_path / "labels.npy")):
         result = reconstruct(capture, small(support=support))
         x, y, z = result.mesh.vertices.unbind(1)
         if support == "cylinder":
@@ -344,6 +345,9 @@ def test_a_support_that_cannot_be_is_refused(tmp_path) -> None:
     capture = scan_of(mesh, ball(mesh), PARALLEL)
     with pytest.raises(dtv.CaptureError, match=r"nowhere\.npy"):
         reconstruct(capture, small(support=str(tmp_path / "nowhere.npy")))
+    np.save(tmp_path / "all.npy", np.ones((4, 4, 4), np.uint8))
+    with pytest.raises(dtv.CaptureError, match="has one value everywhere, so it tells no support"):
+        reconstruct(capture, small(support=str(tmp_path / "all.npy")))
     aside = ProjectionGeometry.from_dict(PARALLEL | {"volume_size": [0.5, 0.5, 2], "volume_offset": [0.6, 0, 0]})
     with pytest.raises(dtv.CaptureError, match="no cylinder"):
         reconstruct(dataclasses.replace(capture, geometry=aside), small(support="cylinder"))

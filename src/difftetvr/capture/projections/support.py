@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 
 from difftetvr.capture.projections.geometry import ProjectionGeometry
-from difftetvr.capture.volumes.volume import Volume
+from difftetvr.capture.volumes.voxels import load_volume
 from difftetvr.errors import CaptureError, CaptureWarning
 
 CYLINDER = "cylinder"
@@ -49,11 +49,11 @@ class OutsideSupport:
             return OutsideSupport(geometry.bounds.to(device), None)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", CaptureWarning)
-            values = Volume.load(support).values
-        inside = torch.from_numpy(values > values.min())
+            values = load_volume(support).values
+        inside = values > values.min()
         if not bool(inside.any()):
             raise CaptureError(f"'{support}' has one value everywhere, so it tells no support; leave it out.")
-        return OutsideSupport(geometry.bounds.to(device), inside.permute(2, 1, 0).to(device))
+        return OutsideSupport(geometry.bounds.to(device), inside.to(device))
 
     def contains(self, places: torch.Tensor) -> torch.Tensor:
         """(N,) bool, which of (N, 3) places are outside of the support."""
