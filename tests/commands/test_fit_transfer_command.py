@@ -48,6 +48,12 @@ def test_it_writes_a_function_that_render_takes(simulation, tmp_path, capsys):
     assert "knots = 6, this run asks for 7" in fails(capsys, *command, "--resume", "--knots", "7")
     assert cli.main([*command, "--resume"]) == 0
     assert cli.main([*command, "--overwrite"]) == 0
+    before = json.loads((out / "metrics.json").read_text())
+    assert cli.main(["fit-transfer", "-o", str(out), "--resume"]) == 0  # with all that the run was made with
+    after = json.loads((out / "metrics.json").read_text())
+    assert after["iterations"] == 4 and after.keys() == before.keys()
+    (out / "config.json").write_text("{}")
+    assert "--resume cannot use" in fails(capsys, "fit-transfer", "-o", out, "--resume")
 
 
 def test_volumes_are_scalars_and_images(tmp_path, capsys):

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import dataclasses
 import shlex
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
+import tyro
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from difftetvr.cli.arguments import Groups
 from difftetvr.cli.inverse.viewpoint import make_folder
 from difftetvr.cli.options import CAPTURE_GROUPS, CaptureOptions, MeshOptions, TrustOptions, is_volume
+from difftetvr.cli.saved import folder_to_resume, saved_options
 from difftetvr.errors import CaptureError, FitError, counted
 from difftetvr.files import require_writable
+from difftetvr.fitting.records.folder import write_json
 
 if TYPE_CHECKING:
     import torch
@@ -42,16 +47,9 @@ class Known:
 
 
 @dataclass(frozen=True)
-class FitTransfer:
-    """Find the transfer function through which known scalars look as in images."""
+class Search:
+    """What is looked for, and how."""
 
-    scalars: Annotated[str, Positional, arg(metavar="SCALARS")]
-    """The known scalars: a mesh with point or cell data, a volume, or tooth."""
-    images: Annotated[str, Positional, arg(metavar="IMAGES")]
-    """The images: photographs with their cameras, a saved capture (.npz), or a volume with its --transfer-function,
-    whose views are rendered; cameras are in the coordinates of the scalars."""
-    output: Annotated[Path, arg(aliases=["-o"], metavar="OUT")]
-    """Folder for transfer_function.json, which other commands take, report.png, metrics.json and the checkpoint."""
     scalar: str | None = None
     """Name of the point or cell data of a mesh, with a component if wanted; default: the only data there are."""
     knots: int = 32
@@ -70,14 +68,47 @@ class FitTransfer:
     """Tetrahedra onto which a volume is resampled."""
     seed: int = 0
     """Seed of the random values to begin with."""
-    start: Path | None = None
+    start: str | None = None
     """Transfer function to begin with, .json or .xml; default: random values."""
-    truth: Path | None = None
+    truth: str | None = None
     """Transfer function that made the images, to be drawn beside; nothing is learned from it."""
+
+
+@dataclass(frozen=True)
+class SavedTransferRun:
+    """What the config.json of such a run holds.
+
+    Attributes:
+        scalars: Name of the known scalars.
+        images: Name of the images.
+        search: What is looked for.
+        mesh_options: How a mesh of scalars is read.
+        capture_options: How images are read, and volumes.
+    """
+
+    scalars: str
+    images: str
+    search: Search
+    mesh_options: MeshOptions
+    capture_options: CaptureOptions
+
+
+@dataclass(frozen=True)
+class FitTransfer:
+    """Find the transfer function through which known scalars look as in images."""
+
+    scalars: Annotated[str, Positional, arg(metavar="SCALARS")]
+    """The known scalars: a mesh with point or cell data, a volume, or tooth. May be left out with --resume."""
+    images: Annotated[str, Positional, arg(metavar="IMAGES")]
+    """The images: photographs with their cameras, a saved capture (.npz), or a volume with its --transfer-function,
+    whose views are rendered; cameras are in the coordinates of the scalars. May be left out with --resume."""
+    output: Annotated[Path, arg(aliases=["-o"], metavar="OUT")]
+    """Folder for transfer_function.json, which other commands take, report.png, metrics.json and the checkpoint."""
+    search: OmitArgPrefixes[Search] = field(default_factory=Search)
     device: str | None = None
     """Where to render, such as cpu or cuda; default: the best that works."""
     resume: bool = False
-    """Go on with the run in the output folder."""
+    """Go on with the run in the output folder; SCALARS, IMAGES and options that are not given are taken from it."""
     overwrite: bool = False
     """Replace the run in the output folder."""
     mesh: OmitArgPrefixes[MeshOptions] = field(default_factory=MeshOptions)
@@ -99,13 +130,16 @@ class FitTransfer:
         from difftetvr.inverse.transfer.fit import fit_transfer
         from difftetvr.optics.transfer_function import TransferFunction
 
-        start, truth = (None if file is None else TransferFunction.load(file) for file in (self.start, self.truth))
+        start, truth = (
+            None if file is None else TransferFunction.load(file) for file in (self.search.start, self.search.truth)
+        )
         known = self._known(console)
         config = self._config(known)
         capture = self._capture(console)
         device = resolve_device(self.device)
         make_folder(self.output, _FILES)
         checkpoint = self._require_free()
+        write_json(self.output / "config.json", dataclasses.asdict(self._saved()))
         mesh, values = known.mesh.to(device=device), known.values.to(device)
         try:
             result = fit_transfer(
@@ -120,11 +154,28 @@ class FitTransfer:
                 on_progress=_Display(console),
             )
         except KeyboardInterrupt:
-            words = [self.scalars, self.images, "-o", str(self.output), "--resume"]
-            console.print(f"Interrupted; continue with the same options: {shlex.join(['fit-transfer', *words])} ...")
+            words = ["difftetvr", "fit-transfer", "-o", str(self.output), "--resume"]
+            console.print(f"Interrupted; continue with {shlex.join(words)}")
             raise
         self._write(mesh, result, capture, truth)
         _print_summary(console, result, self.output)
+
+    @staticmethod
+    def defaults(args: Sequence[str]) -> FitTransfer | None:
+        """The command with the options of the run to go on with; None: as declared.
+
+        Raises:
+            FitError: They cannot be read.
+        """
+        folder = folder_to_resume(args)
+        saved = None if folder is None else saved_options(folder, SavedTransferRun)
+        if saved is None:
+            return None
+        command = FitTransfer(saved.scalars, saved.images, tyro.MISSING, saved.search)
+        return dataclasses.replace(command, mesh=saved.mesh_options, views_of=saved.capture_options)
+
+    def _saved(self) -> SavedTransferRun:
+        return SavedTransferRun(self.scalars, self.images, self.search, self.mesh, self.views_of)
 
     def _known(self, console: Console) -> Known:
         from difftetvr.capture.volumes.volume import Volume
@@ -139,11 +190,11 @@ class FitTransfer:
             else:
                 of_file = (options.shape, options.dtype, options.spacing, options.value_range)
                 volume = Volume.load(self.scalars, *of_file)
-            mesh, values = volume_on_grid(volume, self.cells)
+            mesh, values = volume_on_grid(volume, self.search.cells)
             console.print(f"{self.scalars} on {counted(mesh.num_cells, 'tetrahedron', 'tetrahedra')}", highlight=False)
             return Known(mesh, values, "vertex", (0.0, 1.0))
         data = self.mesh.load(Path(self.scalars), console)
-        scalar = scalar_of(data, self.scalar)
+        scalar = scalar_of(data, self.search.scalar)
         if (note := missing_note(scalar)) is not None:
             console.print(note)
         value_range = options.value_range
@@ -156,15 +207,15 @@ class FitTransfer:
 
         attenuation = 25.0 if self.views_of.attenuation is None else self.views_of.attenuation
         return TransferConfig(
-            knots=self.knots,
-            move_knots=not self.no_move,
-            iterations=self.iterations,
-            rate=self.rate,
-            smoothness=self.smoothness,
-            batch_views=self.batch_views,
+            knots=self.search.knots,
+            move_knots=not self.search.no_move,
+            iterations=self.search.iterations,
+            rate=self.search.rate,
+            smoothness=self.search.smoothness,
+            batch_views=self.search.batch_views,
             attenuation=attenuation,
             value_range=known.value_range,
-            seed=self.seed,
+            seed=self.search.seed,
         )
 
     def _capture(self, console: Console) -> Capture:
@@ -183,14 +234,11 @@ class FitTransfer:
         return checkpoint
 
     def _write(self, mesh: TetMesh, result: TransferResult, capture: Capture, truth: object) -> None:
-        from difftetvr.fitting.records.folder import write_json
         from difftetvr.view.transfer_report import save_transfer_report
 
         result.transfer_function.save(self.output / "transfer_function.json")
         result.start.save(self.output / "start.json")
         save_transfer_report(self.output / "report.png", mesh, result, capture, truth)  # type: ignore[arg-type]
-        options = {"scalars": self.scalars, "images": self.images, "scalar": self.scalar, "cells": self.cells}
-        write_json(self.output / "config.json", options | {"capture_options": self.views_of.given()})
         write_json(self.output / "metrics.json", result.metrics)
 
 
