@@ -196,8 +196,10 @@ def _say_choices(console: Console, given: TomographyConfig, run: Reconstruction,
         f"line integrals up to {scan.peak:.4g}, mean density {scan.density_unit:.4g}{per}{noise}",
         highlight=False,
     )
-    if given.cells is None:
-        console.print(f"Chosen for these projections: --cells {run.config.cells}", highlight=False)
+    chosen = {"--cells": (given.cells, run.config.cells), "--batch-views": (given.batch_views, run.config.batch_views)}
+    words = [f"{option} {value}" for option, (asked, value) in chosen.items() if asked is None]
+    if words:
+        console.print(f"Chosen for these projections: {' '.join(words)}", highlight=False)
 
 
 def _outcome(result: TomographyResult, compared: dict[str, Any], folder: RunFolder) -> list[str]:

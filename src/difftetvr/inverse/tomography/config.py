@@ -32,6 +32,7 @@ _START = 0.1
 mend the same residual."""
 
 _LEAST_CELLS, _MOST_CELLS, _PIXELS_PER_CELL = 20_000, 300_000, 40
+_FEWEST_VIEWS, _MOST_VIEWS = 2, 10
 
 _RANGES = {
     "cells": (1, MAX_CELLS),
@@ -62,8 +63,8 @@ class TomographyConfig(Schedule):
     pixels to learn from, between 20 000 and 300 000."""
     iterations: int = 1200
     """Number of optimisation steps; after the last one, densities are solved for once more by themselves."""
-    batch_views: int = 2
-    """Training views per step."""
+    batch_views: int | None = None
+    """Training views per step. Default: 2, or up to 10 where views have so few pixels that these are within --rays."""
     rays: int = 32_768
     """Rays per step, at most: pixels of each view in equal steps, beginning with another one each time."""
     likelihood: Likelihood = "gaussian"
@@ -135,7 +136,9 @@ class TomographyConfig(Schedule):
         """These options with those that are left open chosen for a scan."""
         pixels = len(capture.train_indices) * math.prod(capture.geometry.shape[1:])
         cells = self.cells or max(_LEAST_CELLS, min(pixels // _PIXELS_PER_CELL, _MOST_CELLS))
-        return dataclasses.replace(self, cells=cells)
+        views = min(self.rays // math.prod(capture.geometry.shape[1:]), len(capture.train_indices))
+        batch = self.batch_views or max(_FEWEST_VIEWS, min(views, _MOST_VIEWS))
+        return dataclasses.replace(self, cells=cells, batch_views=batch)
 
     @property
     def steps(self) -> int:
@@ -145,7 +148,7 @@ class TomographyConfig(Schedule):
     @property
     def batch(self) -> int:
         """Training views per step."""
-        return self.batch_views
+        return self.batch_views or _FEWEST_VIEWS
 
     def strategy(self) -> Strategy | None:
         """How the mesh is refined, in rounds between which densities can settle; None if it is not."""
