@@ -28,7 +28,7 @@ from rich.table import Table
 
 from difftetvr.capture import ProjectionCapture
 from difftetvr.files import atomic_write
-from difftetvr.fitting import Exchange, ProgressDisplay
+from difftetvr.fitting import ProgressDisplay
 from difftetvr.inverse.tomography import TomographyConfig, TomographyResult, reconstruct
 from difftetvr.inverse.tomography.measurements import Measurements
 from difftetvr.mesh.io import save
@@ -54,7 +54,7 @@ class Row:
 
 def configs_of(options: argparse.Namespace) -> list[tuple[str, TomographyConfig]]:
     """Names of all rows, with how they are made."""
-    rounds = Exchange(start=TomographyConfig().exchange.start, rounds=options.rounds)
+    rounds = replace(TomographyConfig().exchange, rounds=options.rounds)
     common = TomographyConfig(iterations=options.iterations, rays=options.rays, exchange=rounds, evaluate_every=0)
     made = []
     for name, cells, weight in product(options.rows, options.cells, options.tv):

@@ -33,8 +33,8 @@ class Exchange(OptionGroup):
     share: float = 0.08
     """Share of the cells that one round takes away."""
     views: int | None = None
-    """Random training views on which gains and losses are predicted; default: 12, for photographs that begin with a
-    visual hull 36."""
+    """Random training views on which gains and losses are predicted; default: 12, for projections and for photographs
+    that begin with a visual hull 36."""
     start: float = 0.6
     """New vertices start at this part of their best surplus over the interpolated values."""
     long: float = 0.6

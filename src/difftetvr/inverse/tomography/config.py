@@ -32,7 +32,7 @@ _START = 0.1
 mend the same residual."""
 
 _LEAST_CELLS, _MOST_CELLS, _PIXELS_PER_CELL = 20_000, 300_000, 40
-_FEWEST_VIEWS, _MOST_VIEWS = 2, 10
+_FEWEST_VIEWS, _MOST_VIEWS, _JUDGED_VIEWS = 6, 10, 36
 
 _RANGES = {
     "cells": (1, MAX_CELLS),
@@ -64,7 +64,7 @@ class TomographyConfig(Schedule):
     iterations: int = 1200
     """Number of optimisation steps; after the last one, densities are solved for once more by themselves."""
     batch_views: int | None = None
-    """Training views per step. Default: 2, or up to 10 where views have so few pixels that these are within --rays."""
+    """Training views per step. Default: 6, or up to 10 where views have so few pixels that these are within --rays."""
     rays: int = 32_768
     """Rays per step, at most: pixels of each view in equal steps, beginning with another one each time."""
     likelihood: Likelihood = "gaussian"
@@ -106,11 +106,11 @@ class TomographyConfig(Schedule):
     """Iterations between glances at a few held-out views, for the curves only; 0: never."""
     checkpoint_seconds: float = 60.0
     """Seconds between checkpoints."""
-    motion: Motion = field(default_factory=lambda: Motion(rate=0.8, final_rate=0.04, barrier=0.03))
+    motion: Motion = field(default_factory=lambda: Motion(rate=0.8, final_rate=0.04, barrier=0.01))
     """How vertices move."""
-    exchange: Exchange = field(default_factory=lambda: Exchange(start=_START))
+    exchange: Exchange = field(default_factory=lambda: Exchange(start=_START, views=_JUDGED_VIEWS))
     """Options of --refine exchange."""
-    grow: Grow = field(default_factory=lambda: Grow(start=_START))
+    grow: Grow = field(default_factory=lambda: Grow(start=_START, views=_JUDGED_VIEWS))
     """Options of --refine grow."""
 
     def __post_init__(self) -> None:
@@ -136,9 +136,9 @@ class TomographyConfig(Schedule):
         """These options with those that are left open chosen for a scan."""
         pixels = len(capture.train_indices) * math.prod(capture.geometry.shape[1:])
         cells = self.cells or max(_LEAST_CELLS, min(pixels // _PIXELS_PER_CELL, _MOST_CELLS))
-        views = min(self.rays // math.prod(capture.geometry.shape[1:]), len(capture.train_indices))
-        batch = self.batch_views or max(_FEWEST_VIEWS, min(views, _MOST_VIEWS))
-        return dataclasses.replace(self, cells=cells, batch_views=batch)
+        fitting = self.rays // math.prod(capture.geometry.shape[1:])
+        batch = min(max(_FEWEST_VIEWS, min(fitting, _MOST_VIEWS)), max(1, len(capture.train_indices)))
+        return dataclasses.replace(self, cells=cells, batch_views=self.batch_views or batch)
 
     @property
     def steps(self) -> int:
