@@ -60,6 +60,7 @@ def losses(count: int) -> Counter[str]:
 def test_iterations_copy_numbers_alone_and_read_few_of_them(photos, copies_of, background, batch):
     config = dataclasses.replace(CONFIG, refine="none", background=background, batch_views=batch)
     trainer = Trainer(photos, config)
+    assert trainer.mesh.topology.cell_adjacency.is_cuda  # made once, and looked at
     of_view = RENDERING + BACKGROUND + (BACKGROUND if background == "random" else Counter())
     unread = 0
     for iteration in range(config.iterations):

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import reduce
+from functools import partial, reduce
 from operator import add
 
 import numpy as np
@@ -36,6 +36,7 @@ class JudgedPixels:
         valid: (H, W) bool, those that count; None: all.
         background: Linear RGB behind the volume.
         views: Views that they are of.
+        make_rays: Makes the rays of the camera where the truth is.
     """
 
     rays: Camera | Rays
@@ -43,11 +44,13 @@ class JudgedPixels:
     valid: torch.Tensor | None
     background: Color
     views: int = 1
+    make_rays: Callable[[], Rays] | None = None
 
     @staticmethod
     def of(truth: Truth, view: int, background: Color) -> JudgedPixels:
         """All pixels of a view."""
-        return JudgedPixels(truth.camera(view), truth.image(view, background), truth.valid(view), background)
+        shown = truth.image(view, background), truth.valid(view), background
+        return JudgedPixels(truth.camera(view), *shown, make_rays=partial(truth.rays, view))
 
     @property
     def count(self) -> int:
@@ -57,12 +60,12 @@ class JudgedPixels:
     @property
     def in_a_row(self) -> JudgedPixels:
         """The same as rays, in an order in which neighbours see neighbouring cells."""
-        if isinstance(self.rays, Rays):
+        if self.make_rays is None:
             return self
-        rays = self.rays.with_pose(self.rays.world_to_camera.to(self.truth.device)).rays()
+        rays = self.make_rays()
         parts = [part.expand(*self.truth.shape).reshape(1, -1, 3) for part in (rays.origins, rays.directions)]
         truth, valid = self.truth.reshape(1, -1, 3), None if self.valid is None else self.valid.reshape(1, -1)
-        pixels = replace(self, rays=Rays(*parts), truth=truth, valid=valid)
+        pixels = replace(self, rays=Rays(*parts), truth=truth, valid=valid, make_rays=None)
         order = image_order(tuple(self.truth.shape[:2]), truth.device)
         return pixels if order is None else pixels._at(order.long())
 
