@@ -46,6 +46,7 @@ def test_it_writes_a_function_that_render_takes(simulation, tmp_path, capsys):
     assert cli.main(["render", flow, "-o", str(picture), *shown, "--device", "cpu"]) == 0
     assert "run in" in fails(capsys, *command)
     assert "knots = 6, this run asks for 7" in fails(capsys, *command, "--resume", "--knots", "7")
+    assert json.loads((out / "config.json").read_text())["search"]["knots"] == 6
     assert cli.main([*command, "--resume"]) == 0
     assert cli.main([*command, "--overwrite"]) == 0
     before = json.loads((out / "metrics.json").read_text())

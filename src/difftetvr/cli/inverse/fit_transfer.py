@@ -139,7 +139,8 @@ class FitTransfer:
         device = resolve_device(self.device)
         make_folder(self.output, _FILES)
         checkpoint = self._require_free()
-        write_json(self.output / "config.json", dataclasses.asdict(self._saved()))
+        if not self.resume:
+            write_json(self.output / "config.json", dataclasses.asdict(self._saved()))
         mesh, values = known.mesh.to(device=device), known.values.to(device)
         try:
             result = fit_transfer(
