@@ -92,8 +92,21 @@ def saved_run(args: Sequence[str]) -> SavedRun | None:
         if origin.resume:
             raise FitError("--resume goes on with the options of the run itself; leave out --config, or --resume.")
         return SavedRun.in_file(origin.config)
+    return options_to_resume(args, SavedRun)
+
+
+def options_to_resume(args: Sequence[str], kind: type[_Saved]) -> _Saved | None:
+    """What the config.json of the run holds that arguments ask to go on with; None where there is none.
+
+    Args:
+        args: The arguments.
+        kind: Dataclass of what it is to hold.
+
+    Raises:
+        FitError: The file is damaged.
+    """
     folder = folder_to_resume(args)
-    return None if folder is None else SavedRun.in_folder(folder)
+    return None if folder is None else saved_options(folder, kind)
 
 
 def folder_to_resume(args: Sequence[str]) -> RunFolder | None:

@@ -26,7 +26,6 @@ from difftetvr.fitting.records.unread import Unread
 from difftetvr.fitting.refinement import Refinement, Situation, Strategy
 from difftetvr.fitting.refinement.adaptive_run import AdaptiveRun
 from difftetvr.fitting.refinement.pixels import Judgement
-from difftetvr.fitting.refinement.strategy import USUAL_VIEWS
 from difftetvr.mesh.field import Field
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.rendering.gauss_newton import ImageModel
@@ -264,7 +263,7 @@ class Trainer(AdaptiveRun):
         self.require_agreement()
 
     def _refine(self, strategy: Strategy) -> None:
-        judgement, mesh = self._judgement(strategy.views or USUAL_VIEWS), self.mesh
+        judgement, mesh = self._judgement(self._judged_views), self.mesh
         unit = self.capture.density_unit
 
         def model(steps: torch.Tensor | None) -> ImageModel:

@@ -12,6 +12,7 @@ from torch.autograd.function import once_differentiable
 
 from difftetvr.backend import Backend, backend_for
 from difftetvr.memory import tried_twice
+from difftetvr.mesh.shapes import dot
 from difftetvr.recording import few_lengths, replayed
 
 COUNTS = (0, 3, 8, 15)
@@ -122,8 +123,7 @@ class _Source:
     def direction(self) -> tuple[list[Any], Any]:
         """Unit vectors, and one over what they were divided by."""
         vector = self.row(self.vectors, 3)
-        square = dr.fma(vector[0], vector[0], dr.fma(vector[1], vector[1], vector[2] * vector[2]))
-        scale = 1.0 / dr.fmax(dr.sqrt(square), _NOWHERE)
+        scale = 1.0 / dr.fmax(dr.sqrt(dot(vector, vector)), _NOWHERE)
         return [scale * part for part in vector], scale
 
     def coefficients(self) -> list[list[Any]]:
@@ -148,7 +148,7 @@ def _see(source: _Source, length: int) -> Any:
     basis = _functions(source.direction()[0], source.degree)
     # Comparisons with NaN are false: it stays what it is, for somebody to find.
     colors = [dr.select(part < 0, 0, part) for part in source.colors(basis, source.coefficients())]
-    (seen,) = _written(source, [colors], length)
+    seen = _written(source, colors, length)
     dr.eval(seen)
     return seen
 
@@ -164,24 +164,21 @@ def _see_backward(
     by_coefficients = [function * by for function in basis for by in derivative]
     by_direction = [source.backend.Float(0)] * 3
     for three, slopes in zip(coefficients, _slopes(direction, source.degree), strict=True):
-        weight = dr.fma(three[0], derivative[0], dr.fma(three[1], derivative[1], three[2] * derivative[2]))
+        weight = dot(three, derivative)
         by_direction = [dr.fma(weight, slope, so_far) for slope, so_far in zip(slopes, by_direction, strict=True)]
-    along = sum(part * by for part, by in zip(direction, by_direction, strict=True))
+    along = dot(direction, by_direction)
     by_vector = [scale * (by - along * part) for part, by in zip(direction, by_direction, strict=True)]
     wanted = ((derivative, needs_color), (by_coefficients, needs_harmonics), (by_vector, needs_vectors))
-    written = iter(_written(source, [row for row, is_wanted in wanted if is_wanted], length))
-    found = tuple(next(written) if is_wanted else None for _, is_wanted in wanted)
+    found = tuple(_written(source, row, length) if is_wanted else None for row, is_wanted in wanted)
     dr.eval(*found)
     return found
 
 
-def _written(source: _Source, rows: list[list[Any]], length: int) -> list[Any]:
-    """Flat (length, W) arrays of rows of W numbers."""
-    arrays = []
-    for row in rows:
-        arrays.append(dr.empty(source.backend.Float, len(row) * length))
-        dr.scatter(arrays[-1], source.backend.Floats(row), source.lanes)
-    return arrays
+def _written(source: _Source, row: list[Any], length: int) -> Any:
+    """Flat (length, W) of W numbers each."""
+    array = dr.empty(source.backend.Float, len(row) * length)
+    dr.scatter(array, source.backend.Floats(row), source.lanes)
+    return array
 
 
 def _functions(direction: Sequence[Any], degree: int) -> list[Any]:

@@ -262,10 +262,10 @@ def as_rays(camera: RaySource | Rays) -> Rays:
     """
     if isinstance(camera, Rays):
         return camera
-    rays: Any = camera.rays() if callable(camera.rays) else camera.rays
+    make: Any = camera.rays
+    rays: Rays = make() if callable(make) else make
     require_type(rays, Rays, "What the camera's rays() returns", "return difftetvr.Rays", DiffTetError)
-    own: Rays = rays
-    return own
+    return rays
 
 
 def _seen(

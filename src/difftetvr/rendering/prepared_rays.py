@@ -152,11 +152,7 @@ def lane_order(backend: Backend, shape: tuple[int, ...]) -> Any | None:
 def lane_places(backend: Backend, shape: tuple[int, ...]) -> Any | None:
     """Which lane has each ray, see :func:`lane_order`."""
     order = image_order(shape, backend.device)
-    if order is None:
-        return None
-    places = torch.empty_like(order)
-    places[order.long()] = torch.arange(len(order), dtype=order.dtype, device=order.device)
-    return backend.uints(places)
+    return None if order is None else backend.uints(torch.argsort(order).int())
 
 
 def _rows(values: torch.Tensor, device: torch.device, wide: torch.dtype) -> torch.Tensor:

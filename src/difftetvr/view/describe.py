@@ -145,9 +145,7 @@ def capture_table(name: str, capture: Capture) -> Table:
     """Number and size of the images, split and bounds of a capture."""
     lower, upper = capture.bounds.tolist()
     table = _table(name)
-    table.add_row(
-        "views", f"{len(capture.cameras)} ({len(capture.train_indices)} training, {len(capture.test_indices)} held out)"
-    )
+    table.add_row("views", _views(capture))
     sizes = Counter(capture.image_sizes).most_common()
     table.add_row("image size" if len(sizes) == 1 else "image sizes", _sizes(sizes))
     lenses = Counter(camera.model for camera in capture.cameras if isinstance(camera, LensCamera)).most_common()
@@ -171,11 +169,11 @@ def capture_table(name: str, capture: Capture) -> Table:
 def scan_table(name: str, scan: ProjectionCapture) -> Table:
     """Number and size of the views, geometry and line integrals of projections."""
     geometry, values = scan.geometry, scan.line_integrals
-    views, height, width = geometry.shape
+    _, height, width = geometry.shape
     lower, upper = geometry.bounds.tolist()
     unit = "" if geometry.unit is None else f" {geometry.unit}"
     table = _table(name)
-    table.add_row("views", f"{views} ({len(scan.train_indices)} training, {len(scan.test_indices)} held out)")
+    table.add_row("views", _views(scan))
     table.add_row("pixels", f"{width} x {height}")
     table.add_row("rays", "parallel" if geometry.detector.source is None else "from a source")
     if geometry.angles is not None:
@@ -187,6 +185,11 @@ def scan_table(name: str, scan: ProjectionCapture) -> Table:
     if scan.valid is not None:
         table.add_row("left out", f"{100.0 * (1.0 - len(known) / values.numel()):.2g} % of the pixels")
     return table
+
+
+def _views(capture: Capture | ProjectionCapture) -> str:
+    train, test = len(capture.train_indices), len(capture.test_indices)
+    return f"{train + test} ({train} training, {test} held out)"
 
 
 def volume_table(name: str, summary: VolumeSummary) -> Table:

@@ -15,7 +15,7 @@ from difftetvr.cli.arguments import Groups
 from difftetvr.cli.inverse.run_command import Begun, RunCommand
 from difftetvr.cli.live.watching import WATCH_GROUP, WatchOptions
 from difftetvr.cli.options import CAPTURE_GROUPS, CaptureOptions, TrustOptions, is_volume
-from difftetvr.cli.saved import folder_to_resume, goes_on_with, saved_options
+from difftetvr.cli.saved import goes_on_with, options_to_resume, saved_options
 from difftetvr.errors import FitError, counted
 from difftetvr.fitting.records.folder import RunFolder
 from difftetvr.inverse.scalars.config import Refine, ScalarConfig
@@ -125,8 +125,7 @@ class FitScalar(RunCommand):
         Raises:
             FitError: They cannot be read.
         """
-        folder = folder_to_resume(args)
-        saved = None if folder is None else saved_options(folder, SavedScalarRun)
+        saved = options_to_resume(args, SavedScalarRun)
         if saved is None:
             return None
         return FitScalar(saved.capture, tyro.MISSING, saved.scalars, saved.capture_options)

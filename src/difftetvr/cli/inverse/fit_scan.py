@@ -16,7 +16,7 @@ from difftetvr.cli.arguments import Groups
 from difftetvr.cli.inverse.run_command import Begun, RunCommand
 from difftetvr.cli.live.watching import WATCH_GROUP, WatchOptions
 from difftetvr.cli.options import TRUST_GROUPS, TrustOptions, saying
-from difftetvr.cli.saved import folder_to_resume, goes_on_with, saved_options
+from difftetvr.cli.saved import goes_on_with, options_to_resume, saved_options
 from difftetvr.errors import FitError, counted
 from difftetvr.fitting.records.folder import RunFolder
 from difftetvr.inverse.tomography.config import TomographyConfig
@@ -166,8 +166,7 @@ class FitScan(RunCommand):
         Raises:
             FitError: They cannot be read.
         """
-        folder = folder_to_resume(args)
-        saved = None if folder is None else saved_options(folder, SavedScanRun)
+        saved = options_to_resume(args, SavedScanRun)
         if saved is None:
             return None
         return FitScan(saved.capture, tyro.MISSING, saved.tomography, saved.scan_options)

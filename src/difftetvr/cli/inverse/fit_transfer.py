@@ -16,7 +16,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from difftetvr.cli.arguments import Groups
 from difftetvr.cli.inverse.viewpoint import make_folder
 from difftetvr.cli.options import CAPTURE_GROUPS, CaptureOptions, MeshOptions, TrustOptions, is_volume
-from difftetvr.cli.saved import folder_to_resume, saved_options
+from difftetvr.cli.saved import options_to_resume
 from difftetvr.errors import CaptureError, FitError, counted
 from difftetvr.files import require_writable
 from difftetvr.fitting.records.folder import write_json
@@ -168,8 +168,7 @@ class FitTransfer:
         Raises:
             FitError: They cannot be read.
         """
-        folder = folder_to_resume(args)
-        saved = None if folder is None else saved_options(folder, SavedTransferRun)
+        saved = options_to_resume(args, SavedTransferRun)
         if saved is None:
             return None
         command = FitTransfer(saved.scalars, saved.images, tyro.MISSING, saved.search)

@@ -16,7 +16,15 @@ from difftetvr.fitting.records.checkpoint import Checkpoint
 from difftetvr.fitting.records.history import History, RefinementRecord
 from difftetvr.fitting.records.result import Picture, Progress
 from difftetvr.fitting.records.unread import Unread
-from difftetvr.fitting.refinement.strategy import EmptySpace, Model, Moment, Refinement, Situation, Strategy
+from difftetvr.fitting.refinement.strategy import (
+    USUAL_VIEWS,
+    EmptySpace,
+    Model,
+    Moment,
+    Refinement,
+    Situation,
+    Strategy,
+)
 from difftetvr.inputs import as_whole
 from difftetvr.mesh.changes.change import MeshChange
 from difftetvr.mesh.field import Field
@@ -127,6 +135,11 @@ class AdaptiveRun:
     def _glanced_views(self) -> list[int]:
         """A few held-out views, evenly spread."""
         return self._test_views[:: max(1, math.ceil(len(self._test_views) / _GLANCE_VIEWS))]
+
+    @property
+    def _judged_views(self) -> int:
+        """Training views that a refinement is judged on."""
+        return (None if self.strategy is None else self.strategy.views) or USUAL_VIEWS
 
     def _moment(self) -> Moment:
         return Moment(self.iteration, self.config.steps, self._epoch, self.mesh.num_cells, self.budget)

@@ -21,7 +21,6 @@ from difftetvr.fitting.records.unread import Unread
 from difftetvr.fitting.refinement import Refinement
 from difftetvr.fitting.refinement.adaptive_run import AdaptiveRun
 from difftetvr.fitting.refinement.pixels import Judgement
-from difftetvr.fitting.refinement.strategy import USUAL_VIEWS
 from difftetvr.inverse.scalars.config import ScalarConfig
 from difftetvr.inverse.scalars.scalars import Scalars
 from difftetvr.inverse.transfer.config import TransferConfig
@@ -243,7 +242,7 @@ class ScalarReconstruction(AdaptiveRun):
     def _refine_if_due(self) -> None:
         if self.strategy is None or not self.strategy.is_due(self._moment()):
             return
-        mesh, views = self.mesh, self.strategy.views or USUAL_VIEWS
+        mesh, views = self.mesh, self._judged_views
         chosen = self.config.refinement_views_at(self.iteration, views, len(self._train_views))
         judgement = Judgement.of(
             self._truth,

@@ -18,7 +18,6 @@ from difftetvr.fitting.records.history import History
 from difftetvr.fitting.records.unread import Unread
 from difftetvr.fitting.refinement import Refinement, Strategy
 from difftetvr.fitting.refinement.adaptive_run import AdaptiveRun
-from difftetvr.fitting.refinement.strategy import USUAL_VIEWS
 from difftetvr.inverse.tomography.alignment import Alignment
 from difftetvr.inverse.tomography.config import TomographyConfig
 from difftetvr.inverse.tomography.densities import Densities
@@ -230,7 +229,7 @@ class Reconstruction(AdaptiveRun):
         if self.strategy is None or not self.strategy.is_due(self._moment()):
             return
         mesh, densities = self.mesh, self.densities
-        parts = self._pixels_to_judge(self.strategy.views or USUAL_VIEWS, Judgement.wanted(mesh))
+        parts = self._pixels_to_judge(self._judged_views, Judgement.wanted(mesh))
         judgement = Judgement(parts, self.config.likelihood, self.config.deterministic)
 
         def model(steps: torch.Tensor | None) -> ImageModel:

@@ -62,8 +62,9 @@ class Detector:
         if len(devices) > 1:
             names = " and ".join(sorted(f"'{device}'" for device in devices))
             raise CameraError(f"The detector's vectors are on {names}; move them to one device.")
-        for name in given if devices else ():
-            object.__setattr__(self, name, getattr(self, name).to(*devices))
+        for device in devices:  # vectors that were no tensors go to that of the others
+            for name in given:
+                object.__setattr__(self, name, getattr(self, name).to(device))
         if len(views - {torch.Size([])}) > 1:
             counts = ", ".join(str(shape[0]) for shape in sorted(views - {torch.Size([])}))
             raise CameraError(
