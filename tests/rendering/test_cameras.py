@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -104,54 +103,6 @@ def check_derivatives(make: Callable[..., object], parameters: list[Tensor]) -> 
 
 
 # --------------------------------------------------------------------------------------------------- where they look
-
-
-@pytest.mark.parametrize(("model", "count"), COEFFICIENTS)
-def test_lenses_are_those_of_opencv_and_colmap(model: str, count: int) -> None:
-    """Points on the rays of pixels are projected to these pixels by the models as they are documented."""
-    coefficients = COEFFICIENTS[model, count]
-    camera = LensCamera(torch.eye(4), 300.0, 280.0, 161.0, 118.0, 320, 240, model=model, coefficients=coefficients)
-    points = camera.ray_directions().reshape(-1, 3).numpy()
-    project = {"opencv": opencv, "fisheye": opencv_fisheye, "thin-prism-fisheye": colmap_thin_prism}[model]
-    seen = project(points, coefficients) * (300.0, 280.0) + (161.0, 118.0)
-    columns, rows = np.meshgrid(np.arange(320) + 0.5, np.arange(240) + 0.5)
-    np.testing.assert_allclose(seen, np.stack([columns, rows], -1).reshape(-1, 2), atol=1e-6)
-
-
-def opencv(points: np.ndarray, coefficients: list[float]) -> np.ndarray:
-    """The model of cv::projectPoints, written down from its manual."""
-    k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = coefficients + [0.0] * (12 - len(coefficients))
-    x, y = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]
-    r2 = x**2 + y**2
-    radial = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + k4 * r2 + k5 * r2**2 + k6 * r2**3)
-    across = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2) + s1 * r2 + s2 * r2**2
-    down = y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y + s3 * r2 + s4 * r2**2
-    return np.stack([across, down], axis=-1)
-
-
-def opencv_fisheye(points: np.ndarray, coefficients: list[float]) -> np.ndarray:
-    """The model of cv::fisheye::projectPoints, written down from its manual."""
-    k1, k2, k3, k4 = coefficients
-    a, b = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]
-    r = np.hypot(a, b)
-    theta = np.arctan(r)
-    distorted = theta * (1 + k1 * theta**2 + k2 * theta**4 + k3 * theta**6 + k4 * theta**8)
-    scale = np.where(r > 1e-12, distorted / np.maximum(r, 1e-12), 1.0)
-    return np.stack([scale * a, scale * b], axis=-1)
-
-
-def colmap_thin_prism(points: np.ndarray, coefficients: list[float]) -> np.ndarray:
-    """COLMAP's ThinPrismFisheyeCameraModel, written down from its documentation."""
-    k1, k2, p1, p2, k3, k4, sx1, sy1 = coefficients
-    u, v = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]
-    radius = np.hypot(u, v)
-    scale = np.where(radius > 1e-12, np.arctan(radius) / np.maximum(radius, 1e-12), 1.0)
-    u, v = scale * u, scale * v
-    r2 = u * u + v * v
-    radial = k1 * r2 + k2 * r2**2 + k3 * r2**3 + k4 * r2**4
-    du = u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u) + sx1 * r2
-    dv = v * radial + 2 * p2 * u * v + p1 * (r2 + 2 * v * v) + sy1 * r2
-    return np.stack([u + du, v + dv], axis=-1)
 
 
 def test_a_lens_without_distortion_is_a_pinhole() -> None:

@@ -101,11 +101,11 @@ def _lens_arrays(cameras: Sequence[Camera]) -> dict[str, np.ndarray]:
 
     Coefficients are finite, so what is none is known.
     """
+    models = [camera.model if isinstance(camera, LensCamera) else "" for camera in cameras]
+    if not any(models):
+        return {}
     given = [camera.coefficients.tolist() if isinstance(camera, LensCamera) else [] for camera in cameras]
     most = max(map(len, given))
-    if not most:
-        return {}
-    models = [camera.model if isinstance(camera, LensCamera) else "" for camera in cameras]
     padded = [values + [np.nan] * (most - len(values)) for values in given]
     return dict(zip(_LENS, (np.array(models), np.array(padded)), strict=True))
 

@@ -143,6 +143,29 @@ def test_pixels_that_the_lens_cannot_have_made_are_masked(tmp_path: Path) -> Non
     check_sentence(error.value)
 
 
+def test_lenses_that_nerfstudio_lists(tmp_path: Path) -> None:
+    write_distorted(tmp_path, {"k1": 0.5, "k2": 0.0})
+    content = json.loads((tmp_path / "transforms.json").read_text())
+    content |= {"distortion_params": [-0.1, 0.02, 0.0, 0.03, 0.01, 0.0]}
+    aria = [0.01 * count for count in range(12)]
+    content["frames"][1] |= {"camera_model": "FISHEYE624", "distortion_params": aria}
+    content["frames"][2] |= {"distortion_params": [-0.1, 0.0, 0.0, 0.0, 0.02, 0.0]}
+    content["frames"][3] |= {"is_fisheye": True, "distortion_params": [-0.1, 0.02, 0.0, 0.01, 0.0, 0.0]}
+    content["frames"][4] |= {"distortion_params": None, "k4": 0.02}
+    dump(tmp_path / "transforms.json", content)
+    capture = load_capture(tmp_path, keep_lens=True)
+    capture.save(tmp_path / "c.npz")
+    for cameras in (capture.cameras, load_capture(tmp_path / "c.npz").cameras):
+        lenses = [(camera.model, camera.coefficients.tolist()) for camera in cameras[:5]]  # type: ignore[attr-defined]
+        assert lenses == [
+            ("nerfstudio", [-0.1, 0.02, 0.0, 0.03, 0.01, 0.0]),
+            ("rad-tan-thin-prism-fisheye", aria),
+            ("opencv", [-0.1, 0.0, 0.02, 0.0, 0.0]),
+            ("fisheye", [-0.1, 0.02, 0.0, 0.01]),
+            ("nerfstudio", [0.5, 0.0, 0.0, 0.02, 0.0, 0.0]),
+        ]
+
+
 @pytest.mark.parametrize("mixed", [False, True])
 def test_saved_captures_keep_the_lens(tmp_path: Path, mixed: bool) -> None:
     write_distorted(tmp_path, BARREL)

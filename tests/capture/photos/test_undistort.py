@@ -8,8 +8,8 @@ import torch
 
 from difftetvr.capture.photos.undistort import known_pixels, pinhole_of, undistorted, undistorted_mask
 from difftetvr.errors import CaptureError
-from difftetvr.rendering.cameras.distortion import Distortion
 from difftetvr.rendering.cameras.intrinsics import Intrinsics
+from difftetvr.rendering.cameras.lenses.distortion import Distortion
 from difftetvr.srgb import linear_to_srgb, srgb_to_linear
 
 
@@ -24,6 +24,13 @@ LENSES = {
     "rational": opencv(k1=0.1, k2=-0.05, p1=1e-3, p2=2e-3, k3=0.01, k4=0.05, k5=0.02, k6=0.003),
     "fox": opencv(k1=0.0578421, k2=-0.0805099, p1=-0.000980296, p2=0.00015575),
     "prism": opencv(k1=-0.1, s1=0.01, s2=-0.02, s3=0.02, s4=0.01),
+    "tilt": opencv(k1=-0.1, p1=0.01, tau_x=0.1, tau_y=-0.05),
+    "nerfstudio": Distortion.named("nerfstudio", {"k1": -0.1, "k4": 0.05, "p2": 0.01}),
+    "fov": Distortion.named("fov", {"omega": 0.8}),
+    "division": Distortion.named("division", {"k": -0.2}),
+    "pincushion by division": Distortion.named("division", {"k": 0.15}),
+    "eucm": Distortion.named("eucm", {"alpha": 0.5, "beta": 1.2}),
+    "fisheye624": Distortion.named("rad-tan-thin-prism-fisheye", {"k0": 0.05, "k5": 0.01, "p0": 0.01, "s3": -0.02}),
     "fisheye": Distortion.named("fisheye", {"k1": 0.05, "k2": -0.01, "k3": 0.002}),
     "prism of a fisheye": Distortion.named("thin-prism-fisheye", {"k1": 0.05, "p1": 0.01, "sx1": 0.02, "sy1": -0.01}),
 }

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 import torch
 
 from difftetvr.errors import CameraError, CaptureError
-from difftetvr.rendering.cameras.distortion import Distortion
 from difftetvr.rendering.cameras.intrinsics import Intrinsics
 from difftetvr.rendering.cameras.lens import LensCamera
+from difftetvr.rendering.cameras.lenses.distortion import Distortion
 from difftetvr.rendering.cameras.pinhole import Camera
 
 _FARTHEST = 1e12  # pixels, and more than any distortion: what is farther overflows later

@@ -1,10 +1,9 @@
 from . import camera_file as camera_file
 from . import checks as checks
 from . import detector as detector
-from . import distortion as distortion
 from . import intrinsics as intrinsics
 from . import lens as lens
-from . import lens_models as lens_models
+from . import lenses as lenses
 from . import panoramic as panoramic
 from . import parallel as parallel
 from . import pinhole as pinhole

@@ -7,7 +7,7 @@ from functools import lru_cache
 
 import torch
 
-from difftetvr.rendering.cameras.distortion import Distortion
+from difftetvr.rendering.cameras.lenses.distortion import Distortion
 
 _AT_ONCE = 1 << 18  # pixels
 _CPU = torch.device("cpu")

@@ -10,9 +10,9 @@ import torch
 
 from difftetvr.errors import CameraError, shown
 from difftetvr.inputs import as_reals
-from difftetvr.rendering.cameras.distortion import Distortion
 from difftetvr.rendering.cameras.intrinsics import FieldOfView, Intrinsics, field_of_view, widest_radius
-from difftetvr.rendering.cameras.lens_models import LENS_MODELS
+from difftetvr.rendering.cameras.lenses.distortion import Distortion
+from difftetvr.rendering.cameras.lenses.models import LENS_MODELS
 from difftetvr.rendering.cameras.pinhole import Camera
 from difftetvr.rendering.cameras.rigid import pencil
 
@@ -28,21 +28,32 @@ class LensCamera(Camera):
     (u, v) = theta (x, y) / rho, theta being its angle with the axis and rho the length of (x, y). With
     r2 = u^2 + v^2 and
 
-        g = (1 + k1 r2 + k2 r2^2 + k3 r2^3 + k4 r2^4) / (1 + d1 r2 + d2 r2^2 + d3 r2^3)
+        g = (1 + k1 r2 + k2 r2^2 + ... + k6 r2^6) / (1 + d1 r2 + d2 r2^2 + d3 r2^3)
 
     it is seen at the pixel (fx u' + cx, fy v' + cy), where
 
         u' = g u + 2 p1 u v + p2 (r2 + 2 u^2) + s1 r2 + s2 r2^2
         v' = g v + p1 (r2 + 2 v^2) + 2 p2 u v + s3 r2 + s4 r2^2
 
-    The order of the coefficients is that of the model's own source: ``"opencv"`` has k1, k2, p1, p2, k3, then d1, d2,
-    d3 (called k4, k5, k6 there), then s1 to s4, and 2, 4, 5, 8 or 12 of them; ``"fisheye"`` has 1, 2 or 4 of k1 to k4;
-    ``"thin-prism-fisheye"`` has COLMAP's k1, k2, p1, p2, k3, k4, sx1 (s1), sy1 (s3). COLMAP's SIMPLE_RADIAL, RADIAL,
-    OPENCV and FULL_OPENCV are ``"opencv"``, its models of fisheyes are the others. Sources: OpenCV's manual, modules
-    calib3d and fisheye; https://colmap.github.io/cameras.html.
+    The order of the coefficients is that of the model's own source:
+
+    - ``"opencv"``: k1, k2, p1, p2, k3, then d1, d2, d3 (called k4, k5, k6 there), s1 to s4, and the two angles tau_x
+      and tau_y, in radians, by which the sensor is tilted behind all this; 2, 4, 5, 8, 12 or 14 of them. COLMAP's
+      SIMPLE_RADIAL, RADIAL, OPENCV and FULL_OPENCV are such.
+    - ``"nerfstudio"``: k1, k2, k3, k4, p1, p2; the first 2 or all.
+    - ``"fov"``: omega, with g = atan(2 r tan(omega / 2)) / (r omega), r^2 being r2.
+    - ``"division"``: k, with g = 2 / (1 + sqrt(1 - 4 k r2)).
+    - ``"eucm"``: alpha and beta, with g = 1 / (alpha sqrt(1 + beta r2) + 1 - alpha).
+    - ``"fisheye"``: none, or 1, 2 or 4 of k1 to k4.
+    - ``"thin-prism-fisheye"``: k1, k2, p1, p2, k3, k4, sx1 (here s1), sy1 (s3).
+    - ``"rad-tan-thin-prism-fisheye"``, also called Fisheye624: k0 to k5 (here k1 to k6), p0, p1 (p2, p1), s0 to s3
+      (s1 to s4); all that is not g is of g u and g v instead of u and v.
+
+    Sources: OpenCV's manual, modules calib3d and fisheye; https://colmap.github.io/cameras.html and COLMAP's
+    sensor/models; cameras/camera_utils.py of nerfstudio.
 
     Attributes:
-        model: One of ``"opencv"``, ``"fisheye"`` and ``"thin-prism-fisheye"``.
+        model: One of those above.
         coefficients: (N,) as above; images are differentiable in them.
 
     Raises:

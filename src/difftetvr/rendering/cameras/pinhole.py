@@ -12,7 +12,7 @@ import torch
 from difftetvr.errors import CameraError, shown
 from difftetvr.inputs import as_reals
 from difftetvr.rendering.cameras.checks import number, pixels, take_pose, take_size
-from difftetvr.rendering.cameras.distortion import Distortion, through_plane
+from difftetvr.rendering.cameras.lenses.distortion import Distortion, through_plane
 from difftetvr.rendering.cameras.rigid import pencil, transformed
 
 if TYPE_CHECKING:

@@ -63,6 +63,10 @@ def test_keypoints_are_where_points_project(tmp_path: Path, suffix: str) -> None
             (FOCAL, FOCAL, *MIDDLE, 0.01, 0.02, 0.003, 0.004, 0.005, 0.006, 0.007, 0.008),
             {"k1": 0.01, "k2": 0.02, "p1": 0.003, "p2": 0.004, "k3": 0.005, "k4": 0.006, "k5": 0.007, "k6": 0.008},
         ),
+        ((7, "FOV"), (FOCAL, FOCAL, *MIDDLE, 0.3), {"omega": 0.3}),
+        ((12, "SIMPLE_DIVISION"), (FOCAL, *MIDDLE, -0.05), {"k": -0.05}),
+        ((13, "DIVISION"), (FOCAL, FOCAL, *MIDDLE, 0.02), {"k": 0.02}),
+        ((16, "EUCM"), (FOCAL, FOCAL, *MIDDLE, 0.3, 1.1), {"alpha": 0.3, "beta": 1.1}),
     ],
 )
 @pytest.mark.parametrize("suffix", [".bin", ".txt"])
@@ -81,6 +85,13 @@ def test_camera_models(tmp_path: Path, suffix: str, model, parameters, distortio
         ((8, "SIMPLE_RADIAL_FISHEYE"), (FOCAL, *MIDDLE, 0.01), "fisheye"),
         ((9, "RADIAL_FISHEYE"), (FOCAL, *MIDDLE, 0.01, 0.02), "fisheye"),
         ((10, "THIN_PRISM_FISHEYE"), (FOCAL, FOCAL, *MIDDLE, *np.arange(1, 9) * 1e-3), "thin-prism-fisheye"),
+        (
+            (11, "RAD_TAN_THIN_PRISM_FISHEYE"),
+            (FOCAL, FOCAL, *MIDDLE, *np.arange(1, 13) * 1e-3),
+            "rad-tan-thin-prism-fisheye",
+        ),
+        ((14, "SIMPLE_FISHEYE"), (FOCAL, *MIDDLE), "fisheye"),
+        ((15, "FISHEYE"), (FOCAL, FOCAL, *MIDDLE), "fisheye"),
     ],
 )
 @pytest.mark.parametrize("suffix", [".bin", ".txt"])
@@ -97,7 +108,7 @@ def test_fisheyes_are_kept(tmp_path: Path, suffix: str, model, parameters, lens:
 
 
 @pytest.mark.parametrize("suffix", [".bin", ".txt"])
-@pytest.mark.parametrize("model", [(7, "FOV"), (11, "RAD_TAN_THIN_PRISM_FISHEYE"), (99, "MADE_UP")])
+@pytest.mark.parametrize("model", [(17, "EQUIRECTANGULAR"), (99, "MADE_UP")])
 def test_other_camera_models_are_refused(tmp_path: Path, suffix: str, model: tuple[int, str]) -> None:
     write_colmap(tmp_path, suffix, model, (1.0,) * 8)
     with pytest.raises(CaptureError, match="not supported; undistort") as error:

@@ -14,8 +14,8 @@ import torch
 
 from difftetvr.capture.photos.lens import Lens, make_camera
 from difftetvr.errors import CaptureError
-from difftetvr.rendering.cameras.distortion import Distortion
-from difftetvr.rendering.cameras.lens_models import COLMAP_CAMERAS
+from difftetvr.rendering.cameras.lenses.distortion import Distortion
+from difftetvr.rendering.cameras.lenses.models import COLMAP_CAMERAS
 
 # By the number that binary files use.
 MODEL_NAMES = (
@@ -31,6 +31,12 @@ MODEL_NAMES = (
     "RADIAL_FISHEYE",
     "THIN_PRISM_FISHEYE",
     "RAD_TAN_THIN_PRISM_FISHEYE",
+    "SIMPLE_DIVISION",
+    "DIVISION",
+    "SIMPLE_FISHEYE",
+    "FISHEYE",
+    "EUCM",
+    "EQUIRECTANGULAR",
 )
 
 

@@ -30,11 +30,14 @@ from difftetvr.capture.photos.photo_set import (
 from difftetvr.capture.photos.poses import from_opengl
 from difftetvr.capture.photos.readers.ply_points import read_ply_points
 from difftetvr.errors import CaptureError, shown
-from difftetvr.rendering.cameras.distortion import Distortion
-from difftetvr.rendering.cameras.lens_models import LENS_MODELS, TRANSFORMS_CAMERAS
+from difftetvr.rendering.cameras.lenses.distortion import Distortion
+from difftetvr.rendering.cameras.lenses.models import LENS_MODELS, TRANSFORMS_CAMERAS, FileCamera
 from difftetvr.trust import file_beside
 
 _FISHEYE = "OPENCV_FISHEYE"  # what is_fisheye of instant-ngp stands for
+_COEFFICIENTS = sorted(
+    {name for kinds in TRANSFORMS_CAMERAS.values() for kind in kinds for name in LENS_MODELS[kind.model].coefficients}
+)
 # What changes nothing here, although the file says it.
 _UNUSED = {
     "depth_file_path": "depth maps (depth_file_path)",
@@ -69,8 +72,8 @@ def read_nerf_synthetic(folder: Path) -> PhotoSet:
 def read_transforms(path: Path) -> PhotoSet:
     """A transforms.json of nerfstudio or instant-ngp.
 
-    Intrinsics may stand at the top or, overriding that, in each frame. Distortion is OpenCV's k1, k2, p1, p2, k3, that
-    of fisheyes its k1, k2, k3, k4.
+    Intrinsics may stand at the top or, overriding that, in each frame. Distortion is k1, k2, k3, k4, p1, p2, that of
+    fisheyes OpenCV's k1, k2, k3, k4, or nerfstudio's list of ``distortion_params``.
     nerfstudio's lists of ``train_filenames`` and ``test_filenames`` (or ``val_filenames``) are kept to.
     The points of its ``ply_file_path`` are the sparse points.
     Where there is an ``aabb_scale``, the bounds are instant-ngp's unit cube, by its ``scale`` and ``offset``.
@@ -143,19 +146,22 @@ def _lens(values: dict[str, Any], where: str) -> Lens:
             f"The camera model of {where} is {shown(model)}, which is not known; undistort its images to a pinhole "
             "first."
         )
-    kind = TRANSFORMS_CAMERAS[_FISHEYE if values.get("is_fisheye") else model.upper()]
+    kinds = TRANSFORMS_CAMERAS[_FISHEYE if values.get("is_fisheye") else model.upper()]
 
     def number(key: str) -> float | None:
         return number_of(values, key, where)
 
-    names = {name for lens in LENS_MODELS.values() for name in lens.coefficients}
-    others = sorted(key for key in names.difference(kind.parameters) if number(key))
-    if others:
+    given = _distortion_params(values, kinds[-1], where)
+    if given is None:
+        given = {key: number(key) or 0.0 for key in _COEFFICIENTS}
+    distorting = sorted(key for key, value in given.items() if value)
+    kind = next((kind for kind in kinds if set(distorting) <= set(kind.parameters)), None)
+    if kind is None:
+        other = next(key for key in distorting if key not in kinds[-1].parameters)
         raise CaptureError(
-            f"{where[0].upper()}{where[1:]} has the distortion {others[0]}, which the lens model '{kind.model}' is not "
-            f"read with; undistort it first."
+            f"{where[0].upper()}{where[1:]} has the distortion {other}, which the lens model '{kinds[-1].model}' is "
+            "not read with; undistort it first."
         )
-    coefficients = {key: number(key) or 0.0 for key in kind.parameters if key in names}
     return Lens(
         fx=number("fl_x"),
         fy=number("fl_y"),
@@ -165,8 +171,22 @@ def _lens(values: dict[str, Any], where: str) -> Lens:
         angle_y=number("camera_angle_y"),
         width=pixels_of(values, "w", where),
         height=pixels_of(values, "h", where),
-        distortion=Distortion.named(kind.model, coefficients),
+        distortion=Distortion.named(kind.model, {key: given.get(key, 0.0) for key in kind.parameters}),
     )
+
+
+def _distortion_params(values: dict[str, Any], kind: FileCamera, where: str) -> dict[str, float] | None:
+    """Coefficients by name that nerfstudio's ``distortion_params`` lists; None where there are none."""
+    listed = values.get("distortion_params")
+    if listed is None:
+        return None
+    numbers = numbers_of(listed)
+    names = max(kind.parameters, LENS_MODELS["nerfstudio"].coefficients, key=len)
+    if numbers.shape != (len(names),) or not np.isfinite(numbers).all():
+        raise CaptureError(
+            f"The distortion_params of {where} are {shown(listed)}, not {len(names)} finite numbers; correct them."
+        )
+    return dict(zip(names, numbers.tolist(), strict=True))
 
 
 def _sparse_points(content: dict[str, Any], file: Path) -> tuple[np.ndarray | None, np.ndarray | None]:

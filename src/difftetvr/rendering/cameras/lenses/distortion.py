@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
 import torch
 
-from difftetvr.rendering.cameras.lens_models import LENS_MODELS
+from difftetvr.rendering.cameras.lenses.models import LENS_MODELS
+from difftetvr.rendering.cameras.lenses.radial import PROFILES, Coefficients, as_tensor
 
 _NEWTON_STEPS = 40
+_STEPS_UNSEEN = 8
 _CONVERGED = 1e-9
 _FOUND = 1e-6  # by which points that were found may miss those that were asked for
 _WIDEST = math.radians(89.5)  # of the angles at which folds of lenses that are no fisheyes are looked for
 _RADII, _TURNS = 512, 16
+_DECENTRED = ("p1", "p2", "s1", "s2", "s3", "s4")
 
 Jacobian = tuple[Any, Any, Any, Any]
 """Derivatives du'/du, du'/dv, dv'/du, dv'/dv."""
@@ -68,58 +71,77 @@ class Distortion:
     def _terms(self) -> dict[str, Any]:
         return dict(zip(LENS_MODELS[self.model].terms, self.coefficients, strict=False))
 
+    @property
+    def _numbers(self) -> Distortion:
+        """The same lens with numbers for coefficients, which are waited for once."""
+        held = [value for value in self.coefficients if isinstance(value, torch.Tensor)]
+        numbers = iter(torch.stack(held).tolist() if held else [])
+        return Distortion(
+            self.model, tuple(next(numbers) if isinstance(c, torch.Tensor) else float(c) for c in self.coefficients)
+        )
+
     def distort(self, points: torch.Tensor) -> torch.Tensor:
         """(..., 2) where undistorted coordinates, (..., 2), are seen."""
-        c = self._terms
-        x, y = points.unbind(-1)
-        r2 = x * x + y * y
-        g, _ = _radial(r2, c)
-        p1, p2, s1, s2, s3, s4 = (c.get(name, 0.0) for name in ("p1", "p2", "s1", "s2", "s3", "s4"))
-        across = g * x + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + r2 * (s1 + s2 * r2)
-        down = g * y + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y + r2 * (s3 + s4 * r2)
-        return torch.stack([across, down], dim=-1)
+        return self._bent(points)[0]
 
     def jacobian(self, points: torch.Tensor) -> Jacobian:
         """Derivatives of :meth:`distort` at undistorted coordinates, (..., 2); each is (...)."""
-        c = self._terms
+        return self._bent(points)[1]
+
+    def _bent(self, points: torch.Tensor) -> tuple[torch.Tensor, Jacobian]:
+        """Where points are seen, and the derivatives of that."""
+        lens, c = LENS_MODELS[self.model], self._terms
         x, y = points.unbind(-1)
-        r2 = x * x + y * y
-        g, slope = _radial(r2, c)
-        p1, p2, s1, s2, s3, s4 = (c.get(name, 0.0) for name in ("p1", "p2", "s1", "s2", "s3", "s4"))
-        mixed = 2 * slope * x * y + 2 * (p1 * x + p2 * y)
-        across, down = 2 * (s1 + 2 * s2 * r2), 2 * (s3 + 2 * s4 * r2)
-        return (
-            g + 2 * slope * x * x + 2 * p1 * y + 6 * p2 * x + across * x,
-            mixed + across * y,
-            mixed + down * x,
-            g + 2 * slope * y * y + 6 * p1 * y + 2 * p2 * x + down * y,
-        )
+        g, slope = PROFILES[lens.profile].factor(x * x + y * y, c)
+        mixed = 2 * slope * x * y
+        seen = torch.stack([g * x, g * y], dim=-1)
+        jacobian: Jacobian = (g + 2 * slope * x * x, mixed, mixed, g + 2 * slope * y * y)
+        if any(name in c for name in _DECENTRED):
+            shift, change = _decentred(seen if lens.is_chained else points, c)
+            seen = seen + shift
+            moved = _product(change, jacobian) if lens.is_chained else change
+            jacobian = tuple(one + other for one, other in zip(jacobian, moved, strict=True))
+        if "t1" in c:
+            seen, change = _tilted(seen, _tilt(c["t1"], c["t2"], points))
+            jacobian = _product(change, jacobian)
+        return seen, jacobian
 
     def keeps_orientation(self, points: torch.Tensor) -> torch.Tensor:
         """(...) bool, whether the lens is one-to-one around undistorted coordinates, neither mirrored nor turned."""
-        a, b, c, d = self.jacobian(points)
-        return (a * d - b * c > 0) & (a + d > 0)
+        return _keeps_orientation(self.jacobian(points))
 
     def undistort(self, seen: torch.Tensor) -> torch.Tensor:
         """(..., 2) undistorted coordinates of what is seen at (..., 2), by Newton's method; differentiable.
 
         NaN where the lens cannot have made a point, be it that nothing is seen there or only beyond a fold.
         """
-        fixed = Distortion(self.model, tuple(map(_number, self.coefficients)))
-        target, found = seen.detach(), seen.detach().clone()
+        fixed, target = self._numbers, seen.detach()
         with torch.no_grad():
-            for _ in range(_NEWTON_STEPS):
-                residual = fixed.distort(found) - target
-                if not bool((residual.abs() > _CONVERGED).any()):
-                    break
-                found = found - _solved(fixed.jacobian(found), residual)
-            is_sound = ((fixed.distort(found) - target).abs() < _FOUND).all(-1) & fixed.keeps_orientation(found)
+            found = fixed._newton(target)
+            ends, jacobian = fixed._bent(found)
+            is_sound = ((ends - target).abs() < _FOUND).all(-1) & _keeps_orientation(jacobian)
             is_sound &= found.square().sum(-1) < _fold(fixed) ** 2
             # Where there are none, derivatives must be finite all the same.
             found = torch.where(is_sound[..., None], found, 0.0)
+            jacobian = fixed.jacobian(found)
         # One more step that autograd sees: its derivatives are those of the implicit function.
-        exact = found - _solved(fixed.jacobian(found), self.distort(found) - seen)
+        exact = found - _solved(jacobian, self.distort(found) - seen)
         return torch.where(is_sound[..., None], exact, torch.nan)
+
+    def _newton(self, target: torch.Tensor) -> torch.Tensor:
+        """Undistorted coordinates of what is seen at target, where there are any."""
+        guess = PROFILES[LENS_MODELS[self.model].profile].guess
+        found = target / as_tensor(guess(target.square().sum(-1), self._terms), target)[..., None]
+        for step in range(_NEWTON_STEPS):
+            ends, jacobian = self._bent(found)
+            residual = ends - target
+            # Whether all have converged is waited for on a GPU, so it is asked for seldom there.
+            if (target.is_cpu or step % _STEPS_UNSEEN == _STEPS_UNSEEN - 1) and not bool(
+                (residual.abs() > _CONVERGED).any()
+            ):
+                break
+            found = found - _solved(jacobian, residual)
+        return found
 
     def directions(self, points: torch.Tensor) -> torch.Tensor:
         """(..., 3) unit directions in camera space of undistorted coordinates, (..., 2); differentiable."""
@@ -173,30 +195,54 @@ def _fold(lens: Distortion) -> float:
     return math.pi if lens.is_fisheye else math.inf
 
 
-def _radial(r2: torch.Tensor, c: Mapping[str, Any]) -> tuple[Any, Any]:
-    """The factor g and its derivative by r2."""
-    above, above_slope = _series(r2, [c[name] for name in ("k1", "k2", "k3", "k4") if name in c])
-    below, below_slope = _series(r2, [c[name] for name in ("d1", "d2", "d3") if name in c])
-    g = above / below
-    return g, (above_slope - g * below_slope) / below
+def _decentred(points: torch.Tensor, c: Coefficients) -> tuple[torch.Tensor, Jacobian]:
+    """(..., 2) by how much lenses that are not centred, and thin prisms, shift points, and the derivatives of that."""
+    p1, p2, s1, s2, s3, s4 = (c.get(name, 0.0) for name in _DECENTRED)
+    x, y = points.unbind(-1)
+    r2 = x * x + y * y
+    across = 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + r2 * (s1 + s2 * r2)
+    down = p1 * (r2 + 2 * y * y) + 2 * p2 * x * y + r2 * (s3 + s4 * r2)
+    mixed = 2 * (p1 * x + p2 * y)
+    across_slope, down_slope = 2 * (s1 + 2 * s2 * r2), 2 * (s3 + 2 * s4 * r2)
+    return torch.stack([across, down], dim=-1), (
+        2 * p1 * y + 6 * p2 * x + across_slope * x,
+        mixed + across_slope * y,
+        mixed + down_slope * x,
+        6 * p1 * y + 2 * p2 * x + down_slope * y,
+    )
 
 
-def _series(r2: torch.Tensor, factors: Sequence[Any]) -> tuple[Any, Any]:
-    """1 + f1 r2 + f2 r2^2 + ..., and its derivative by r2."""
-    slopes = [order * factor for order, factor in enumerate(factors, 1)]
-    return _polynomial(r2, [1.0, *factors]), _polynomial(r2, slopes)
+def _tilt(about_x: Any, about_y: Any, like: torch.Tensor) -> torch.Tensor:
+    """(3, 3) map between planes that tilting the sensor by two angles, in radians, makes. Source: OpenCV, calib3d."""
+    one, two = (as_tensor(angle, like) for angle in (about_x, about_y))
+    sx, cx, sy, cy, zero = one.sin(), one.cos(), two.sin(), two.cos(), torch.zeros_like(one)
+    turned = torch.stack([cy, sy * sx, -sy * cx, zero, cx, sx, sy, -cy * sx, cy * cx]).reshape(3, 3)
+    depth = turned[2, 2]
+    back = torch.stack([depth, zero, -turned[0, 2], zero, depth, -turned[1, 2], zero, zero, torch.ones_like(zero)])
+    return back.reshape(3, 3) @ turned
 
 
-def _polynomial(r2: torch.Tensor, factors: Sequence[Any]) -> Any:
-    """f0 + f1 r2 + f2 r2^2 + ..."""
-    total = factors[-1] if factors else 0.0
-    for factor in reversed(factors[:-1]):
-        total = total * r2 + factor
-    return total
+def _tilted(points: torch.Tensor, plane: torch.Tensor) -> tuple[torch.Tensor, Jacobian]:
+    """Points of one plane, (..., 2), on another, by a (3, 3) map between them, and the derivatives of that."""
+    x, y = points.unbind(-1)
+    (a, b, c), (d, e, f), (g, h, i) = (row.unbind() for row in plane.unbind())
+    scale = 1.0 / (g * x + h * y + i)
+    across, down = (a * x + b * y + c) * scale, (d * x + e * y + f) * scale
+    slopes = ((a - across * g), (b - across * h), (d - down * g), (e - down * h))
+    one, two, three, four = (slope * scale for slope in slopes)
+    return torch.stack([across, down], dim=-1), (one, two, three, four)
 
 
-def _number(value: Any) -> float:
-    return value.item() if isinstance(value, torch.Tensor) else float(value)
+def _product(outer: Jacobian, inner: Jacobian) -> Jacobian:
+    """Derivatives of one map after another."""
+    a, b, c, d = outer
+    e, f, g, h = inner
+    return a * e + b * g, a * f + b * h, c * e + d * g, c * f + d * h
+
+
+def _keeps_orientation(jacobian: Jacobian) -> torch.Tensor:
+    a, b, c, d = jacobian
+    return (a * d - b * c > 0) & (a + d > 0)
 
 
 def _solved(jacobian: Jacobian, residual: torch.Tensor) -> torch.Tensor:
