@@ -118,7 +118,7 @@ class RenderTask:
         if not rays.count:
             return None
         if bundle is not None:
-            stretches = Stretches(backend.lanes(rays.lane_count), ends, bundle.sees_all, bundle.begins_at_point)
+            stretches = Stretches.of(backend, rays.lane_count, ends, bundle.sees_all, bundle.begins_at_point)
         plan: SearchPlan | None = TRACERS[self.renderer].plan(backend, self.mesh, rays, stretches)
         return plan
 

@@ -9,10 +9,12 @@ import drjit as dr
 
 from difftetvr.backend import Backend
 from difftetvr.mesh import TetMesh
+from difftetvr.rendering.search.beams import Beam
 from difftetvr.rendering.search.entry import EntryLists, count_entries, list_entries
 from difftetvr.rendering.search.hierarchy import Hierarchy, Leaves, SortedItems, leaves_of_cells
 from difftetvr.rendering.search.hits import Hit, Settle, Visit
 from difftetvr.rendering.search.memory_order import MemoryOrder
+from difftetvr.rendering.search.pencils import Pencils
 from difftetvr.rendering.search.plan import Around, Found, Told
 from difftetvr.rendering.search.scene import Scene, boundary_half_faces
 from difftetvr.rendering.search.starts import (
@@ -35,21 +37,33 @@ class Stretches:
 
     Attributes:
         lane: Numbers of all lanes.
+        pencil: Numbers of the pencils that they make.
         limits: Flat (N, 2) distances between which each ray is looked at; None for all of it.
         sees_all: Whether they turn out not to matter, see :class:`difftetvr.rendering.search.plan.SearchPlan`.
         begins_at_point: Whether all rays are known to begin at one point.
     """
 
     lane: Any
+    pencil: Any
     limits: Any | None
     sees_all: Any | None
     begins_at_point: bool
 
+    @staticmethod
+    def of(backend: Backend, count: int, limits: Any | None, sees_all: Any | None, begins_at_point: bool) -> Stretches:
+        """Those of so many lanes."""
+        lane, pencil = (backend.lanes(number) for number in (count, Pencils.number_of(count)))
+        return Stretches(lane, pencil, limits, sees_all, begins_at_point)
+
     def seen(self, scene: Scene) -> tuple[Lanes, Any, Any]:
         """The rays, and the distances between which they are looked at."""
-        real, rays = scene.backend.Float, scene.rays.of_lanes(self.lane)
+        return self.seen_by(scene, self.lane)
+
+    def seen_by(self, scene: Scene, lane: Any) -> tuple[Lanes, Any, Any]:
+        """The same of some lanes."""
+        real, rays = scene.backend.Float, scene.rays.of_lanes(lane)
         if self.limits is None:
-            near, far = (dr.full(real, end, dr.width(self.lane)) for end in (-dr.inf, dr.inf))
+            near, far = (dr.full(real, end, dr.width(lane)) for end in (-dr.inf, dr.inf))
             return rays, near, far
         ends = dr.gather(scene.backend.Float2, self.limits, rays.pixel, rays.valid)
         return rays, ends[0], ends[1]
@@ -107,14 +121,21 @@ class BundleEntries:
             around = cells_around(scene, self.cell, extent, self.capacity, reach)
         boundary = Hierarchy.over(self.boundary, scene)
         cells = None if self.cells is None else Hierarchy.over(self.cells, scene)
-        counts = count_entries(_BundleSearch(scene, self, boundary, cells, around), scene.rays.count)
-        return Found(counts, around, [part.boxes for part in (boundary, cells) if part is not None])
+        stretches = self.stretches
+        number = Pencils.number_of(scene.rays.lane_count)
+        seen = lambda lane: stretches.seen_by(scene, lane)  # noqa: E731
+        pencils = Pencils.through(scene, boundary, stretches.pencil, number, seen)
+        counts = count_entries(_BundleSearch(scene, self, boundary, pencils, cells, around), scene.rays.count)
+        boxes = [part.boxes for part in (boundary, cells) if part is not None]
+        return Found(counts, around, boxes, pencils=pencils)
 
     def settled(self, scene: Scene, found: Found, told: Told) -> EntryLists:
         """See :meth:`difftetvr.rendering.search.plan.SearchPlan.settled`."""
         boundary, *rest = found.boxes
         cells = None if self.cells is None else Hierarchy(scene.backend, self.cells, rest[0])
-        search = _BundleSearch(scene, self, Hierarchy(scene.backend, self.boundary, boundary), cells, found.around)
+        whole = Hierarchy(scene.backend, self.boundary, boundary)
+        assert found.pencils is not None
+        search = _BundleSearch(scene, self, whole, found.pencils, cells, found.around)
         return list_entries(search, found.counts, told, self.stretches.limits is not None and not told.sees_all)
 
 
@@ -125,6 +146,7 @@ class _BundleSearch:
     scene: Scene
     plan: BundleEntries
     boundary: Hierarchy
+    pencils: Pencils
     cells: Hierarchy | None
     around: Around | None
 
@@ -151,7 +173,10 @@ class _BundleSearch:
 
             return dr.if_stmt((state,), holds_ray(face) & active, held, lambda state: state)
 
-        self.boundary.meet_lines(rays.frame, near, far, rays.valid, at_face, lane)
+        lane, is_many = self.pencils.for_each(lane, rays.valid, at_face, lane)
+        beam = Beam.of(rays, near, far)
+        beam.valid = is_many
+        self.boundary.meet_lines(beam, at_face, lane)
 
     def _for_each_start(self, visit: Visit) -> None:
         """Cells in which rays may start."""

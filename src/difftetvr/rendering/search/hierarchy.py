@@ -18,13 +18,16 @@ import torch
 from difftetvr.backend import Backend
 from difftetvr.mesh.arrays import chunks
 from difftetvr.mesh.topology.topology import Topology
+from difftetvr.rendering.search.beams import Beam, Triple
 from difftetvr.rendering.search.scene import Cells
-from difftetvr.rendering.traversal.rays import Frame, largest_coordinate, rounding_of
+from difftetvr.rendering.traversal.rays import largest_coordinate, rounding_of
 
 CELLS_OF_A_LEAF = 2
 """Searches among cells are slower with one or with four."""
 
 _CURVE_BITS = 20  # of each coordinate
+
+_BLOCK_LEVELS = 2
 
 _LEVELS = 3
 """Levels of a hierarchy that a kernel makes of the one below them."""
@@ -143,37 +146,43 @@ class Hierarchy:
         low, high = _box(self.backend, self.boxes, self.backend.UInt(1))
         return largest_coordinate([low, high])
 
-    def meet_lines(
-        self, frame: Frame, near: Any, far: Any, active: Any, visit: Callable[[Any, Any, Any], Any], state: Any
-    ) -> Any:
+    def meet_lines(self, beam: Beam, visit: Callable[[Any, Any, Any], Any], state: Any) -> Any:
         """Visit all items whose boxes may be crossed by a ray between two distances, and some more, in any order.
 
         Args:
-            frame: The rays; they have origins.
-            near, far: Distances along each.
-            active: Which of them.
+            beam: The rays.
             visit: Takes an item, a mask and the state, and returns the new state.
             state: A PyTree as wide as the rays.
         """
-        assert frame.origin is not None
-        d, margin = frame.direction, self._margin(frame.origin)
-        e = [dr.abs(component) for component in d]
+        test = beam.crosses(self.margin(beam.farthest))
+        return self._descend(test, beam.valid, 0, lambda leaf, state: self._at_items(leaf, visit, state), state)
 
-        def meets(center: list[Any], half: list[Any]) -> Any:
-            c = [x - o for x, o in zip(center, frame.origin or (), strict=True)]
-            ahead = dr.fma(c[0], d[0], dr.fma(c[1], d[1], c[2] * d[2]))
-            reach = dr.fma(half[0], e[0], dr.fma(half[1], e[1], dr.fma(half[2], e[2], margin)))
-            is_met = (ahead + reach >= near) & (ahead - reach <= far)
-            for i, j in ((1, 2), (2, 0), (0, 1)):  # the axes at right angles to the line and to a side of the box
-                beside = dr.abs(c[i] * d[j] - c[j] * d[i])
-                is_met &= beside <= dr.fma(half[i], e[j], dr.fma(half[j], e[i], margin))
-            return is_met
+    def meet_blocks(
+        self, beam: Beam, visit: Callable[[Any, Any], Any], state: Any, is_done: Callable[[Any], Any]
+    ) -> Any:
+        """The same for :attr:`block` items at a time.
 
-        return self._visit(meets, active, visit, state)
+        Args:
+            beam: The rays.
+            visit: Takes the number of a block and the state, and returns the new state.
+            state: A PyTree as wide as the rays.
+            is_done: Takes the state, and tells which rays need no more.
+        """
+        test = beam.crosses(self.margin(beam.farthest))
+        return self._descend(test, beam.valid, self._levels_of_blocks, visit, state, is_done)
+
+    @property
+    def block(self) -> int:
+        """Items of a block, which follow each other."""
+        return self.leaves.leaf_items << self._levels_of_blocks
+
+    @property
+    def _levels_of_blocks(self) -> int:
+        return min(_BLOCK_LEVELS, self.leaves.level)
 
     def meet_points(
         self,
-        point: tuple[Any, Any, Any],
+        point: Triple,
         slack: float,
         active: Any,
         visit: Callable[[Any, Any, Any], Any],
@@ -190,7 +199,7 @@ class Hierarchy:
             state: A PyTree as wide as the points.
             is_done: Takes the state, and tells which points need no more items; None where all do.
         """
-        margin = self._margin(point)
+        margin = self.margin(point)
 
         def holds(center: list[Any], half: list[Any]) -> Any:
             around = dr.fma(dr.fmax(dr.fmax(half[0], half[1]), half[2]), slack, margin)
@@ -199,40 +208,56 @@ class Hierarchy:
                 is_in &= dr.abs(x - c) <= h + around
             return is_in
 
-        return self._visit(holds, active, visit, state, is_done)
+        return self._descend(holds, active, 0, lambda leaf, state: self._at_items(leaf, visit, state), state, is_done)
 
-    def _margin(self, point: tuple[Any, Any, Any]) -> Any:
+    def margin(self, point: Triple) -> Any:
+        """By how much, at most, rounding moves boxes as seen from points."""
         farthest = dr.fmax(dr.fmax(dr.abs(point[0]), dr.abs(point[1])), dr.abs(point[2]))
         return rounding_of(farthest + self.size)
 
-    def _visit(
+    def item(self, place: Any, active: Any) -> tuple[Any, Any]:
+        """Items by their places along the curve, and whether there are any."""
+        is_there = active & (place < self.leaves.count)
+        return dr.gather(self.backend.UInt, self.leaves.items, place, is_there), is_there
+
+    def _at_items(self, leaf: Any, visit: Callable[[Any, Any, Any], Any], state: Any) -> Any:
+        """Visit the items of leaves."""
+        count = self.leaves.leaf_items
+
+        def at_item(place: Any, state: Any) -> tuple[Any, Any]:
+            item, is_there = self.item(place, True)
+            return place + 1, visit(item, is_there, state)
+
+        first = leaf * count
+        if count == 1:
+            return at_item(first, state)[1]
+        end = first + count
+        return dr.while_loop((first, state), lambda place, _: place < end, at_item)[1]
+
+    def _descend(
         self,
         test: Callable[[list[Any], list[Any]], Any],
         active: Any,
-        visit: Callable[..., Any],
+        above: int,
+        visit: Callable[[Any, Any], Any],
         state: Any,
         is_done: Callable[[Any], Any] | None = None,
     ) -> Any:
-        leaves, backend = self.leaves, self.backend
-        uint, count = backend.UInt, leaves.leaf_items
-
-        def at_item(place: Any, state: Any) -> tuple[Any, Any]:
-            is_there = place < leaves.count
-            return place + 1, visit(dr.gather(uint, leaves.items, place, is_there), is_there, state)
-
-        def at_leaf(node: Any, state: Any) -> Any:
-            first = (node - leaves.first) * count
-            if count == 1:
-                return at_item(first, state)[1]
-            end = first + count
-            return dr.while_loop((first, state), lambda place, _: place < end, at_item)[1]
+        """Visit the nodes so many levels above the leaves whose boxes pass a test, counted along the curve."""
+        backend, uint = self.backend, self.backend.UInt
+        bottom = self.leaves.first >> above
 
         def body(node: Any, state: Any) -> tuple[Any, Any]:
             low, high = _box(backend, self.boxes, node)
             center = [0.5 * (a + b) for a, b in zip(low, high, strict=True)]
             is_met = test(center, [0.5 * (b - a) for a, b in zip(low, high, strict=True)])
-            is_leaf = node >= leaves.first
-            state = dr.if_stmt((node, state), is_met & is_leaf, at_leaf, lambda _, state: state)
+            is_leaf = node >= bottom
+            state = dr.if_stmt(
+                (node, state),
+                is_met & is_leaf,
+                lambda node, state: visit(node - bottom, state),
+                lambda _, state: state,
+            )
             behind = node + 1
             behind >>= dr.tzcnt(behind)
             ends = behind == 1 if is_done is None else (behind == 1) | is_done(state)

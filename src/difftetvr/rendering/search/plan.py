@@ -12,6 +12,7 @@ from typing import Any, Protocol
 import drjit as dr
 
 from difftetvr.rendering.search.hits import Settle, Visit
+from difftetvr.rendering.search.pencils import Pencils
 from difftetvr.rendering.search.scene import Scene
 
 
@@ -79,6 +80,7 @@ class Found:
         boxes: Of the hierarchies that were built.
         sorting: By what cells are sorted, and where they are seen; None where they are not.
         flags: (1,) bits, few, to which the plan gives a meaning; None for none.
+        pencils: What neighbouring rays may meet; None where nobody looked for it.
     """
 
     counts: Counts
@@ -86,6 +88,7 @@ class Found:
     boxes: list[Any]
     sorting: tuple[Any, Any] | None = None
     flags: Any | None = None
+    pencils: Pencils | None = None
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ import drjit as dr
 from difftetvr.backend import Backend
 from difftetvr.mesh import TetMesh
 from difftetvr.recording import few_lengths
+from difftetvr.rendering.search.beams import Beam
 from difftetvr.rendering.search.bundle_hits import Stretches
 from difftetvr.rendering.search.hierarchy import Hierarchy, Leaves, leaves_of_cells
 from difftetvr.rendering.search.hits import Hit, Settle, Visit
@@ -191,7 +192,7 @@ class _BundleFragmentSearch:
 
             return dr.if_stmt((state,), is_crossed, crossed, lambda state: state)
 
-        self.cells.meet_lines(rays.frame, near, far, rays.valid, at_cell, lane)
+        self.cells.meet_lines(Beam.of(rays, near, far), at_cell, lane)
         settle()
 
 
