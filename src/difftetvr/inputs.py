@@ -13,6 +13,9 @@ from difftetvr.errors import DiffTetError, shown
 _CONVERSION_FAILS = (TypeError, ValueError, RuntimeError, OverflowError, AssertionError, ImportError)
 """What torch raises for values that make no tensor, and for devices that it was not built for."""
 
+_MOST_AT_ONCE = 1 << 16
+"""Bytes that CUDA takes out of common memory at once."""
+
 
 def require_type(value: Any, kind: type | tuple[type, ...], name: str, advice: str, error: type[DiffTetError]) -> None:
     """Refuse what is no instance of a class.
@@ -93,11 +96,20 @@ def moved(
         raise error(f"Tensors cannot be brought to {target} on this machine; choose another device.") from reason
 
 
-def handed_over(tensor: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
-    """A few numbers in the precision and on the device of another tensor, without a wait of the host for a GPU.
+def handed_over(tensor: torch.Tensor, like: torch.Tensor, dtype: torch.dtype | None = None) -> torch.Tensor:
+    """A tensor on the device of another, without a wait of the host for a GPU; autograd follows it.
 
-    CUDA has read what is in common memory of the host once the call returns; memory that is locked, it reads later.
+    CUDA has read a few numbers in common memory of the host once the call returns. More it would wait for, so they go
+    through memory that is locked, which PyTorch keeps until it has been read.
+
+    Args:
+        tensor: What is handed over.
+        like: Says where to, and at which precision where none is given.
+        dtype: The precision.
     """
-    if tensor.device.type == "cpu" and like.device.type == "cuda":
-        return tensor.to(like.dtype, copy=True).to(like.device, non_blocking=True)
-    return tensor.to(like)
+    dtype = like.dtype if dtype is None else dtype
+    if tensor.device.type != "cpu" or like.device.type != "cuda":
+        return tensor.to(dtype).to(like.device)  # in this order: not all devices know float64
+    is_large = tensor.numel() * tensor.element_size() > _MOST_AT_ONCE
+    copy = torch.empty(tensor.shape, dtype=dtype, pin_memory=is_large).copy_(tensor)
+    return copy.to(like.device, non_blocking=True)

@@ -10,7 +10,7 @@ import torch
 
 from difftetvr import libcuda
 from difftetvr.backend import BackendWarning, default_device, dr, get_backend
-from difftetvr.errors import BackendError, CameraError
+from difftetvr.errors import BackendError, CameraError, MeshError
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.rendering import Camera, Detector, render
 
@@ -159,3 +159,17 @@ def test_the_driver_of_machines_without_development_packages_is_found(tmp_path: 
     code = "from difftetvr.backend import dr; print(bool(dr.has_backend(dr.JitBackend.CUDA)))"
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["True"]
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("part", ["color", "harmonics", "density"])
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), float("-inf")])
+def test_what_is_not_finite_is_named_without_a_look_at_it_first(part: str, value: float) -> None:
+    """Colours that depend on the direction are cut off at 0, which must hide nothing."""
+    mesh = TetMesh.grid((2, 2, 2)).to("cuda")
+    parts = {"color": (3,), "density": (), "harmonics": (3, 3)}
+    values = {name: torch.full((mesh.num_vertices, *shape), 0.5) for name, shape in parts.items()}
+    values[part].view(mesh.num_vertices, -1)[3, 0] = value
+    field = Field(**{name: tensor.to("cuda") for name, tensor in values.items()})
+    with pytest.raises(MeshError, match=f"{part} of vertex 3"):
+        render(mesh, field, CAMERAS["outside"])

@@ -14,6 +14,17 @@ OTHERS = (
     "projected, by vertices, too",
     "bundle of rays, image",
     "bundle of rays that begin among cells, image",
+    "cameras of one size",
+    "cameras of several sizes",
+    "camera on the device",
+    "lens",
+    "parallel",
+    "clip plane",
+    "scalars",
+    "harmonics",
+    "normals",
+    "depth_at",
+    "transmittance_at",
 )
 
 

@@ -16,7 +16,18 @@ import torch
 from cuda_emulation import torch_device
 from cuda_emulation.started import DRIVER
 from difftetvr.mesh import Field, TetMesh
-from difftetvr.rendering import Camera, Rays, render
+from difftetvr.optics import TransferFunction
+from difftetvr.rendering import (
+    Camera,
+    LensCamera,
+    ParallelCamera,
+    Rays,
+    ScalarField,
+    depth_at,
+    render,
+    render_normals,
+    transmittance_at,
+)
 from difftetvr.rendering.gauss_newton import model_image
 
 CAMERA = Camera.look_at((1.5, -1.2, 0.9), (0.0, 0.0, 0.0), fov_y=0.8, width=48, height=32)
@@ -86,7 +97,33 @@ def calls() -> dict[str, Callable[[], object]]:
         "marching", rays=Rays(0.2 * there.origins, there.directions)
     )
     kinds["model by hats"] = modelled()
+    kinds.update(others())
     return kinds
+
+
+def others() -> dict[str, Callable[[], object]]:
+    """Calls with other cameras and for other quantities than images of colours by a pinhole on the host."""
+    mesh, color, density = scene()
+    field = Field(color, density)
+    harmonics = Field(color, density, harmonics=torch.zeros(mesh.num_vertices, 3, 3, device="cuda"))
+    scalars = ScalarField(density, TransferFunction([0.0, 1.0], [0.0, 0.9], torch.rand(2, 3)), 3.0)
+    numbers = (CAMERA.world_to_camera, 40.0, 40.0, 24.0, 16.0, 48, 32)
+    near = Camera.look_at((1.2, -1.0, 0.9), (0.0, 0.0, 0.0), fov_y=0.8, width=40, height=32)
+    there = Camera(CAMERA.world_to_camera.to("cuda"), *numbers[1:])
+    lens = LensCamera(*numbers, coefficients=torch.tensor([0.1, -0.05]))
+    return {
+        "cameras of one size": lambda: render(mesh, field, [CAMERA, CAMERA]),
+        "cameras of several sizes": lambda: render(mesh, field, [CAMERA, near]),
+        "camera on the device": lambda: render(mesh, field, there),
+        "lens": lambda: render(mesh, field, lens),
+        "parallel": lambda: render(mesh, field, ParallelCamera(CAMERA.world_to_camera, (0.03, 0.03), 48, 32)),
+        "clip plane": lambda: render(mesh, field, CAMERA, clip_plane=(0.0, 0.0, 1.0, 0.1)),
+        "scalars": lambda: render(mesh, scalars, CAMERA),
+        "harmonics": lambda: render(mesh, harmonics, CAMERA),
+        "normals": lambda: render_normals(mesh, field, CAMERA),
+        "depth_at": lambda: depth_at(mesh, field, CAMERA, (0.3, 0.5)),
+        "transmittance_at": lambda: transmittance_at(mesh, field, CAMERA, 1.5),
+    }
 
 
 def main() -> None:

@@ -94,6 +94,7 @@ class _Everywhere(TorchDispatchMode):
 
 
 def _run(function: Any, args: Any, kwargs: Any) -> Any:
+    kwargs = {name: value for name, value in kwargs.items() if name != "pin_memory"}  # all memory is the host's
     flat, spec = tree_flatten((args, kwargs))
     ours = [x for x in flat if isinstance(x, EmulatedTensor)]
     asked = next((x for x in flat if isinstance(x, torch.device)), None)

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import torch
 
 from difftetvr.errors import MeshError, counted, shown
-from difftetvr.inputs import as_reals, moved, require_type
+from difftetvr.inputs import as_reals, handed_over, moved, require_type
 from difftetvr.mesh.harmonics import COUNTS, seen_colors
 from difftetvr.mesh.tetmesh import TetMesh
 
@@ -146,7 +146,7 @@ class Field:
         places = mesh.vertices
         if self.location_on(mesh) == "cell":
             places = places[mesh.tets.long()].mean(1)
-        return self._seen_along(places - eye.to(places))
+        return self._seen_along(places - handed_over(eye, places))
 
     def seen_along(self, direction: torch.Tensor) -> Field:
         """The colours that parallel rays see, such as those of an orthographic camera.

@@ -22,12 +22,12 @@ class CellFeatures:
     colours do not count. Gradients reach the features, the density, and a transfer function's knots.
 
     Attributes:
-        features: (T, C) channels of each cell, 0 to 64 of them, of any sign; float32 or float64, finite; may require
-            grad.
+        features: (T, C) channels of each cell, 0 to 64 of them, of any sign; float32 or float64, finite when they are
+            rendered; may require grad.
         medium: The field whose density absorbs.
 
     Raises:
-        MeshError: The features are no such numbers, or the medium is no field.
+        MeshError: The features are no numbers of such a shape, or the medium is no field.
     """
 
     features: torch.Tensor
@@ -41,13 +41,21 @@ class CellFeatures:
                 f"The features have shape {tuple(features.shape)}; pass (T, C), up to {MOST_CHANNELS} channels for "
                 "each cell."
             )
-        finite = torch.isfinite(features.detach()).all(1)
-        if not bool(finite.all()):
-            cell = int(torch.nonzero(~finite)[0])
-            raise MeshError(f"The features of cell {cell} are {shown(features[cell])}; make every feature finite.")
         require_type(
             self.medium, (Field, ScalarField), "The medium", "pass a difftetvr.Field or ScalarField", MeshError
         )
+
+    def validate(self) -> None:
+        """Check that all features are finite, which rendering asks for where something is not.
+
+        Raises:
+            MeshError: One is not; names the first such cell.
+        """
+        finite = torch.isfinite(self.features.detach()).all(1)
+        if not bool(finite.all()):
+            cell = int(torch.nonzero(~finite)[0])
+            values = shown(self.features[cell])
+            raise MeshError(f"The features of cell {cell} are {values}; make every feature finite.")
 
     def location_on(self, mesh: TetMesh) -> Location:
         """Where on a mesh the medium lives.

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from difftetvr.errors import DiffTetError, shown
-from difftetvr.inputs import as_reals
+from difftetvr.inputs import as_reals, handed_over
 from difftetvr.rendering.cameras.pinhole import Camera
 
 _FINITE = "give four finite numbers a, b, c, d, the first three not all 0"
@@ -35,12 +35,11 @@ def clip_limits(
         DiffTetError: These are not four finite numbers, or the normal (a, b, c) is zero.
     """
     coefficients, offset = _plane(plane, like, origin)
-    pose = camera.world_to_camera.to(like)
+    pose = handed_over(camera.world_to_camera, like)
     # No matrix products, which torch.autocast would round.
     normal = (pose[:3, :3] * coefficients).sum(1)
     at_camera = offset - (normal * pose[:3, 3]).sum()
-    directions = camera.ray_directions().to(like.dtype)  # before the device: not all of them know float64
-    near, far = _half_space((directions.to(like.device) * normal).sum(-1), at_camera)
+    near, far = _half_space((handed_over(camera.ray_directions(), like) * normal).sum(-1), at_camera)
     return torch.stack((near.clamp(min=0.0), far), dim=-1)
 
 
@@ -69,14 +68,15 @@ def clip_rays(
 def _plane(plane: Any, like: torch.Tensor, origin: Sequence[float]) -> tuple[torch.Tensor, torch.Tensor]:
     """(3,) normal and offset of a plane of world space, seen from an origin there."""
     exact = as_reals(plane, "clip_plane", DiffTetError, torch.float64, "give a list or tensor a, b, c, d")
-    coefficients = exact.to(like)
-    values = coefficients.detach()
+    values = exact.detach()
     if values.shape != (4,) or not bool(torch.isfinite(values).all()) or not bool(values[:3].any()):
         raise DiffTetError(f"clip_plane is {shown(plane)}; {_FINITE}.")
+    coefficients = handed_over(exact, like)
     offset = coefficients[3]
     if any(origin):
         exact, shift = exact.cpu(), torch.tensor(list(origin), dtype=torch.float64)
-        offset = (exact[3].double() + (exact[:3].double() * shift).sum()).to(like)
+        offset = exact[3].double() + (exact[:3].double() * shift).sum()
+        offset = handed_over(offset, like)
     return coefficients[:3], offset
 
 

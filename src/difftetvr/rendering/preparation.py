@@ -128,7 +128,7 @@ def prepare_view(
     options = _checked(mesh, field, camera, options)
     require_own_threads()  # here already, since in a copy of a process torch may hang, too
     source = camera.relative_to(mesh.origin) if is_plain(camera) else as_rays(camera)
-    field, viewpoint = _seen(mesh, field, source, options.is_parallel)
+    given, (field, viewpoint) = field, _seen(mesh, field, source, options.is_parallel)
     content, parts = _content(mesh, field)
     for tensor in parts:
         if tensor.device != mesh.vertices.device:
@@ -161,6 +161,8 @@ def prepare_view(
         mesh.topology.cell_adjacency  # noqa: B018  refuses loose cells, which have none
     view = _laid_out(task, shape, passed)
     if not _is_common(view):
+        if not view.laid_out.extent.is_sound and not isinstance(given, ScalarField):
+            given.validate(*((mesh,) if isinstance(given, Field) else ()))
         task, passed = _uncommon(task, passed)
         view = _laid_out(task, shape, passed)
     return view if viewpoint is None else replace(view, viewpoint=viewpoint)
@@ -202,7 +204,7 @@ def _is_common(view: PreparedView) -> bool:
     is_sized = extent.largest == 0.0 or _SMALL < extent.largest < LARGEST
     if not (extent.is_sound and is_sized):
         return False
-    return task.camera is None or not _is_blurred(extent, task.camera, view.vertices)
+    return task.camera is None or not _is_blurred(extent, view.vertices)
 
 
 def _uncommon(task: RenderTask, passed: _Passed) -> tuple[RenderTask, _Passed]:
@@ -274,9 +276,15 @@ def _seen(
     """A field without harmonics, as it is seen from a camera or along rays, and from where that is."""
     if not isinstance(field, Field) or field.harmonics is None:
         return field, None
-    field.validate(mesh)
     viewpoint = Viewpoint.of(mesh, camera, is_parallel)
-    return viewpoint.seen(field, mesh), viewpoint
+    if mesh.vertices.is_cpu:
+        field.validate(mesh)
+        return viewpoint.seen(field, mesh), viewpoint
+    # Colours are cut off at 0, and with them what is not finite: densities take it to kernels, which look for it, so
+    # that the host need not wait.
+    is_finite = torch.stack([torch.isfinite(part.detach()).all() for part in (field.color, field.harmonics)]).all()
+    seen = viewpoint.seen(field, mesh)
+    return replace(seen, density=torch.where(is_finite, seen.density, torch.nan)), viewpoint
 
 
 def _content(mesh: TetMesh, field: Field | ScalarField | CellFeatures) -> tuple[Content, tuple[torch.Tensor, ...]]:
@@ -301,21 +309,21 @@ def _camera_space(mesh: TetMesh, camera: Camera) -> torch.Tensor:
     vertices = mesh.vertices
     rounded = camera.to_camera_space(vertices)
     low, high = torch.aminmax(rounded.detach(), dim=0)
-    extent = Extent(tuple(low.tolist()), tuple(high.tolist()), True)
-    if not _is_blurred(extent, camera, vertices):
+    shift = max(abs(row[3]) for row in camera.world_to_camera.tolist()[:3])
+    extent = Extent(tuple(low.tolist()), tuple(high.tolist()), True, shift)
+    if not _is_blurred(extent, vertices):
         return rounded
     exact = camera.to_camera_space(vertices.double())
     return exact if _is_remote(extent) else exact.float()
 
 
-def _is_blurred(extent: Extent, camera: Camera, vertices: torch.Tensor) -> bool:
+def _is_blurred(extent: Extent, vertices: torch.Tensor) -> bool:
     """Whether float32 does not resolve what a camera sees of vertices of some extent, and float64 is there."""
     if backend_for(vertices).at(None).dtype == vertices.dtype:
         return False
     if _is_remote(extent):
         return True
-    shift = max(abs(row[3]) for row in camera.world_to_camera.tolist())
-    return shift > _REMOTE * max(abs(extent.low[2]), abs(extent.high[2]))
+    return extent.shift > _REMOTE * max(abs(extent.low[2]), abs(extent.high[2]))
 
 
 def _is_remote(extent: Extent) -> bool:

@@ -10,6 +10,7 @@ import torch
 from torch.autograd.function import once_differentiable
 
 from difftetvr.backend import Backend, backend_for
+from difftetvr.inputs import handed_over
 from difftetvr.mesh import TetMesh
 from difftetvr.recording import replayed
 from difftetvr.rendering.clip_plane import clip_rays
@@ -45,10 +46,10 @@ class GivenBundle:
     def of(rays: Rays, mesh: TetMesh, clip_plane: Any) -> GivenBundle:
         """Rays before a plane, if there is one, see :func:`difftetvr.render`."""
         rays = rays.relative_to(mesh.origin)
-        device, wide = mesh.vertices.device, backend_for(mesh.vertices).at(None).dtype
-        origins, directions = (_rows(part, device, wide) for part in (rays.origins, rays.directions))
+        like, wide = mesh.vertices, backend_for(mesh.vertices).at(None).dtype
+        origins, directions = (_rows(part, like, wide) for part in (rays.origins, rays.directions))
         ends: Any = (rays.near, rays.far) if clip_plane is None else rays.ends
-        near, far = (_rows(e[..., None], device, wide) if isinstance(e, torch.Tensor) else e for e in ends)
+        near, far = (_rows(e[..., None], like, wide) if isinstance(e, torch.Tensor) else e for e in ends)
         if clip_plane is not None:
             first, last = clip_rays(clip_plane, origins.to(wide), unit_vectors(directions.to(wide)), mesh.origin)
             near, far = torch.maximum(near, first[:, None]), torch.minimum(far, last[:, None])
@@ -155,10 +156,12 @@ def lane_places(backend: Backend, shape: tuple[int, ...]) -> Any | None:
     return None if order is None else backend.uints(torch.argsort(order).int())
 
 
-def _rows(values: torch.Tensor, device: torch.device, wide: torch.dtype) -> torch.Tensor:
-    """(N, width) of (..., width) on a device, in float32 or the best precision that it knows."""
+def _rows(values: torch.Tensor, like: torch.Tensor, wide: torch.dtype) -> torch.Tensor:
+    """(N, width) of (..., width) on the device of another tensor, in float32 or the best precision that it knows."""
     rows = values.reshape(-1, values.shape[-1])
-    return rows.to(device, rows.dtype if rows.dtype in (torch.float32, wide) else torch.float32)
+    dtype = rows.dtype if rows.dtype in (torch.float32, wide) else torch.float32
+    one = None if rows.requires_grad else one_vector(rows)
+    return handed_over(rows, like, dtype) if one is None else handed_over(one, like, dtype).expand(rows.shape)
 
 
 class _Recount(torch.autograd.Function):

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 
 from difftetvr.errors import MeshError, shown
-from difftetvr.inputs import as_number, as_reals, moved, require_type
+from difftetvr.inputs import as_number, as_reals, handed_over, moved, require_type
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.mesh.field import Location, location_of, require_location
 from difftetvr.optics.transfer_function import TransferFunction
@@ -92,14 +92,27 @@ class ScalarField:
 
     def normalised(self) -> torch.Tensor:
         """The scalars in units of the range, so that the transfer function's [0, 1] spans it; differentiable."""
-        low, high = self.limits
         limits = torch.finfo(self.scalar.dtype)
-        # The difference of two numbers may overflow, that of their halves, quarters, ... does not.
-        exponent = math.frexp(max(abs(low), abs(high)))[1]
-        unit = 2.0 ** min(math.frexp(limits.max)[1] - 1 - exponent, 0)
-        extent = max(unit * high - unit * low, limits.tiny) if high > low else 1.0
+        low, unit, extent = self._span_given(limits) if self.value_range else self._span_found(limits)
         # Infinite ones could not be interpolated; they lie so far outside that it makes no difference.
         return ((unit * self.scalar - unit * low) / extent).nan_to_num(posinf=limits.max / 4, neginf=-limits.max / 4)
+
+    def _span_given(self, limits: torch.finfo) -> tuple[float, float, float]:
+        """The lower end of the range, a unit, and in that the range's extent, 1 where it has none.
+
+        The difference of two numbers may overflow, that of their halves, quarters, ... does not.
+        """
+        low, high = self.limits
+        exponent = math.frexp(max(abs(low), abs(high)))[1]
+        unit = math.ldexp(1.0, min(math.frexp(limits.max)[1] - 1 - exponent, 0))
+        return low, unit, max(unit * high - unit * low, limits.tiny) if high > low else 1.0
+
+    def _span_found(self, limits: torch.finfo) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """The same of the scalars themselves, as tensors, for which no host waits."""
+        low, high = torch.aminmax(self.scalar.detach())
+        exponent = torch.frexp(torch.maximum(low.abs(), high.abs())).exponent
+        unit = torch.ldexp(torch.ones_like(low), (math.frexp(limits.max)[1] - 1 - exponent).clamp(max=0))
+        return low, unit, torch.where(high > low, (unit * high - unit * low).clamp(min=limits.tiny), 1.0)
 
     def as_field(self) -> Field:
         """Colour and density at the vertices or cells themselves.
@@ -126,5 +139,7 @@ class ScalarField:
         """
         function = self.transfer_function
         attenuation = min(self.attenuation, torch.finfo(like.dtype).max)
-        density = attenuation * function.opacity.to(like)
-        return function.scalar.to(like), torch.cat((density[:, None], function.color.to(like)), dim=1)
+        scalar, opacity, color = (
+            handed_over(part, like) for part in (function.scalar, function.opacity, function.color)
+        )
+        return scalar, torch.cat((attenuation * opacity[:, None], color), dim=1)

@@ -63,17 +63,19 @@ class Extent:
     Attributes:
         low, high: Least and greatest coordinates.
         is_sound: Whether all of them, and what is at them, can be rendered.
+        shift: Greatest coordinate by which a camera's pose moves the origin; 0 where there is none.
     """
 
     low: tuple[float, float, float]
     high: tuple[float, float, float]
     is_sound: bool
+    shift: float
 
     @staticmethod
     def of(numbers: Sequence[float]) -> Extent:
         """From what kernels found, see :data:`difftetvr.rendering.search.starts.EXTENT`."""
         low, high = (-numbers[1], -numbers[3], -numbers[5]), (numbers[0], numbers[2], numbers[4])
-        return Extent(low, high, not numbers[EXTENT - 2] > 0)
+        return Extent(low, high, not numbers[EXTENT - 2] > 0, max(numbers[EXTENT - 1], 0.0))
 
     @property
     def largest(self) -> float:
@@ -141,7 +143,8 @@ def _lay_out_and_find(
     backend = vertices.backend
     records, cell_records, extent = _lay_out(vertices, cells, *lengths)
     found = plan.find(Scene(backend, records, tables.tets, vertices.stride, rays), extent)
-    return _Made(records, cell_records, found, _summary(backend, extent, found, plan.sees_all))
+    shift = None if vertices.pose is None else _shift(backend, vertices.pose)
+    return _Made(records, cell_records, found, _summary(backend, extent, shift, found, plan.sees_all))
 
 
 def _lay_out(vertices: VertexSource, cells: CellSource | None, vertex_length: int, cell_length: int) -> Any:
@@ -153,10 +156,17 @@ def _lay_out(vertices: VertexSource, cells: CellSource | None, vertex_length: in
     return records, cell_records, extent
 
 
-def _summary(backend: Backend, extent: Any, found: Found, sees_all: Any | None) -> Any:
+def _shift(backend: Backend, pose: Any) -> Any:
+    """Greatest coordinate of the translation of a (4, 4) matrix."""
+    x, y, z = (dr.abs(dr.gather(backend.Float, pose, backend.UInt(4 * row + 3))) for row in range(3))
+    return dr.fmax(dr.fmax(x, y), z)
+
+
+def _summary(backend: Backend, extent: Any, shift: Any | None, found: Found, sees_all: Any | None) -> Any:
     """One array, for one wait; halves, for floats do not hold all integers."""
     summary, none = dr.empty(backend.Float, EXTENT + _NUMBERS), dr.zeros(backend.UInt, 1)
-    dr.scatter(summary, extent, dr.arange(backend.UInt, EXTENT))
+    place = dr.arange(backend.UInt, EXTENT)
+    dr.scatter(summary, extent if shift is None else dr.select(place == EXTENT - 1, shift, extent), place)
     around = none if found.around is None else found.around.count
     whole = (found.counts.most, found.counts.total, around)
     halves = [half for number in whole for half in (number >> 16, number & 0xFFFF)]

@@ -98,7 +98,8 @@ class LensCamera(Camera):
         lens = Distortion(self.model, tuple(self.coefficients.to(self._double_device, torch.float64).unbind()))
         directions = lens.directions(lens.undistort(self.plane_points()))
         known = torch.isfinite(directions.detach()).all(-1)
-        return FieldOfView(torch.where(known[..., None], directions, directions.new_tensor([0.0, 0.0, 1.0])), known)
+        ahead = torch.eye(3, dtype=directions.dtype, device=directions.device)[2]
+        return FieldOfView(torch.where(known[..., None], directions, ahead), known)
 
     def _flattened(self, places: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         lens = Distortion(self.model, tuple(self.coefficients.to(places).unbind()))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from difftetvr.errors import CameraError, shown
-from difftetvr.inputs import as_reals
+from difftetvr.inputs import as_reals, handed_over
 from difftetvr.rendering.cameras.checks import number, pixels, take_pose, take_size
 from difftetvr.rendering.cameras.lenses.distortion import Distortion, through_plane
 from difftetvr.rendering.cameras.rigid import pencil, transformed
@@ -77,7 +77,7 @@ class Camera:
             for name, value in zip(names, numbers, strict=True):
                 if value.numel() != 1:
                     raise CameraError(f"The camera's {name} has the shape {tuple(value.shape)}; pass one number.")
-            given = torch.stack([value.reshape(()).to(learned[0].device, torch.float64) for value in numbers])
+            given = torch.stack([handed_over(value.reshape(()), learned[0], torch.float64) for value in numbers])
         if given is None:
             return
         given = as_reals(given, "The camera's intrinsics", CameraError)

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from difftetvr.errors import DiffTetError, shown
-from difftetvr.inputs import as_reals
+from difftetvr.inputs import as_reals, handed_over
 from difftetvr.memory import tried_twice
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.recording import eager
@@ -117,11 +117,11 @@ def transmittance_at(
         raise DiffTetError(f"distances is {shown(distances)}, with NaN among them; give numbers.")
 
     def transmittances(view: PreparedView, places: torch.Tensor) -> torch.Tensor:
-        along, near = _of_each_ray(places, view, "distances"), torch.zeros((), dtype=torch.float64)
-        shift = view.shift
+        near: Any = 0.0
+        along, shift = _of_each_ray(places, view, "distances"), view.shift
         if view.bundle is not None and shift is not None:
-            along, near = along - shift[:, None], (view.bundle.near - shift)[:, None]
-        along, near, limits = along / view.unit, near.to(along) / view.unit, view.limits
+            along, near = along - shift[:, None], (view.bundle.near - shift)[:, None].to(along) / view.unit
+        along, limits = along / view.unit, view.limits
         if limits is not None:
             # Distances do not pass the far end, so that it need not cut cells, and where it is has its derivatives.
             near, far = limits[:, :1], limits[:, 1:]
@@ -164,7 +164,7 @@ def _of_each_ray(values: torch.Tensor, view: PreparedView, name: str) -> torch.T
         raise DiffTetError(f"There are {rays * width:,} {name} of all rays; ask for {MOST_PIXELS:,} at most at a time.")
     rows = values if values.dim() else values[None]
     try:
-        rows = torch.broadcast_to(rows.to(view.vertices.device), (*view.shape, width))
+        rows = torch.broadcast_to(handed_over(rows, view.vertices, rows.dtype), (*view.shape, width))
     except RuntimeError as reason:
         raise DiffTetError(
             f"{name} has shape {tuple(values.shape)} and the rays {view.shape}; give a number, (K,), or the rays' "

@@ -25,7 +25,8 @@ AROUND = 1 << 10
 """Cells around a camera that there is room for at first: mostly there is one."""
 
 EXTENT = 8
-"""Floats of an extent: greatest of x, -x, y, -y, z and -z; then 1 if something cannot be rendered; and one more."""
+"""Floats of an extent: greatest of x, -x, y, -y, z and -z; then 1 if something cannot be rendered; and one that the
+greatest coordinate of a pose's translation takes the place of."""
 
 NEAR = 1e-4
 """Cells this near to an origin, relative to their size, are tried as the cell that holds it; each ray then decides."""

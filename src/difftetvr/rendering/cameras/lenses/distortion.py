@@ -131,7 +131,7 @@ class Distortion:
     def _newton(self, target: torch.Tensor) -> torch.Tensor:
         """Undistorted coordinates of what is seen at target, where there are any."""
         guess = PROFILES[LENS_MODELS[self.model].profile].guess
-        found = target / as_tensor(guess(target.square().sum(-1), self._terms), target)[..., None]
+        found = target if guess is None else target / guess(target.square().sum(-1), self._terms)[..., None]
         for step in range(_NEWTON_STEPS):
             ends, jacobian = self._bent(found)
             residual = ends - target

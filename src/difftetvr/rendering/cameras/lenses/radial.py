@@ -25,12 +25,12 @@ class Profile:
 
     Attributes:
         factor: (...) g of (...) squares of radii, and (...) its derivative by the squares.
-        guess: (...) by which radii are divided that were seen, of (...) squares of what is seen; 1 where there is no
-            better one. It is a start for Newton's method, and no derivative is taken of it.
+        guess: (...) by what to divide radii that are seen for a start of Newton's method, of their (...) squares; None
+            for nothing.
     """
 
     factor: Callable[[torch.Tensor, Coefficients], tuple[Any, Any]]
-    guess: Callable[[torch.Tensor, Coefficients], Any]
+    guess: Callable[[torch.Tensor, Coefficients], torch.Tensor] | None
 
 
 def as_tensor(value: Any, like: torch.Tensor) -> torch.Tensor:
@@ -78,28 +78,24 @@ def unified(r2: torch.Tensor, c: Coefficients) -> tuple[Any, Any]:
     return g, -0.5 * alpha * beta * g.square() / root
 
 
-def _no_guess(s2: torch.Tensor, c: Coefficients) -> Any:
-    return 1.0
-
-
-def _guess_of_field(s2: torch.Tensor, c: Coefficients) -> Any:
+def _guess_of_field(s2: torch.Tensor, c: Coefficients) -> torch.Tensor:
     omega, seen = as_tensor(c.get("omega", 0.0), s2), s2.sqrt()
     angle = seen * omega
     return torch.where(angle.abs() < _NARROW, 1.0, 2.0 * seen * (0.5 * omega).tan() / angle.tan())
 
 
-def _guess_of_division(s2: torch.Tensor, c: Coefficients) -> Any:
-    return 1.0 + c.get("k", 0.0) * s2
+def _guess_of_division(s2: torch.Tensor, c: Coefficients) -> torch.Tensor:
+    return 1.0 + as_tensor(c.get("k", 0.0), s2) * s2
 
 
-def _guess_of_unified(s2: torch.Tensor, c: Coefficients) -> Any:
-    alpha, beta = c.get("alpha", 0.0), c.get("beta", 0.0)
+def _guess_of_unified(s2: torch.Tensor, c: Coefficients) -> torch.Tensor:
+    alpha, beta = as_tensor(c.get("alpha", 0.0), s2), as_tensor(c.get("beta", 0.0), s2)
     root = (1.0 - (2.0 * alpha - 1.0) * beta * s2).sqrt()
     return (1.0 - alpha * alpha * beta * s2) / (alpha * root + 1.0 - alpha)
 
 
 PROFILES = {
-    "rational": Profile(rational, _no_guess),
+    "rational": Profile(rational, None),
     "field of view": Profile(field_of_view, _guess_of_field),
     "division": Profile(division, _guess_of_division),
     "unified": Profile(unified, _guess_of_unified),
