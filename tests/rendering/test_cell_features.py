@@ -178,5 +178,5 @@ def test_features_that_are_not_finite_are_named(value: float) -> None:
     features[7, 1] = value
     camera = Camera.look_at((2.0, 1.7, 1.4), (0.5, 0.5, 0.5), width=5, height=4)
     for medium in (Field(torch.ones(27, 3), density), Field(torch.ones(mesh.num_cells, 3), torch.ones(mesh.num_cells))):
-        with pytest.raises(MeshError, match="features of cell 7 are .*make every feature finite"):
+        with pytest.raises(MeshError, match=r"features of cell 7 are .*make every feature finite"):
             render(mesh, CellFeatures(features, medium), camera)
