@@ -4,7 +4,7 @@ Every camera is turned by --degrees about a random axis and shifted by --shift o
 box, in a random direction; held-out views, too. They are compared at poses that were found on their own images, as in
 BARF; with true poses as they are.
 
-    python benchmarks/poses.py ../shared/data/lego --downscale 8 [--iterations 2400] [--cells 40000]
+    python benchmarks/poses.py ../shared/data/lego --downscale 8 [--iterations 2400] [--figure poses.png]
 """
 
 from __future__ import annotations
@@ -14,6 +14,9 @@ import dataclasses
 import math
 
 import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 import difftetvr as dtv
 from difftetvr.fitting import CameraRefinement
@@ -47,8 +50,12 @@ def some_views(capture: dtv.Capture, training: int, tested: int) -> dtv.Capture:
     return dataclasses.replace(capture, cameras=cameras, images=images, alphas=alphas, test=capture.test[chosen])
 
 
-def pose_errors(found: list[dtv.Camera], true: list[dtv.Camera], views: list[int]) -> tuple[float, float]:
-    """Mean errors of directions in degrees and of positions in parts of the distance, after a similarity transform."""
+Errors = tuple[torch.Tensor, torch.Tensor]
+"""Of each camera, of directions in degrees and of positions in parts of the distance."""
+
+
+def pose_errors(found: list[dtv.Camera], true: list[dtv.Camera], views: list[int]) -> Errors:
+    """Errors of cameras after a similarity transform."""
     a, b = (torch.stack([cameras[v].position.double() for v in views]) for cameras in (found, true))
     middle_a, middle_b = a.mean(0), b.mean(0)
     left, sizes, right = torch.linalg.svd((b - middle_b).T @ (a - middle_a))
@@ -63,7 +70,47 @@ def pose_errors(found: list[dtv.Camera], true: list[dtv.Camera], views: list[int
         chord = (turned - true[v].world_to_camera[:3, :3].double()).norm() / math.sqrt(8.0)
         angles.append(math.degrees(2.0 * math.asin(min(1.0, float(chord)))))
     distance = (b - middle_b).norm(dim=1).mean()
-    return sum(angles) / len(angles), float((places - b).norm(dim=1).mean() / distance)
+    return torch.tensor(angles), (places - b).norm(dim=1) / distance
+
+
+@dataclasses.dataclass
+class Row:
+    """A fit: what it is called, what a held-out view looks like, how far off its cameras are."""
+
+    name: str
+    psnr: float
+    picture: torch.Tensor
+    errors: Errors
+
+
+def picture_of(result: dtv.FitResult, cameras: list[dtv.Camera], view: int) -> torch.Tensor:
+    """A view over white, as photographs store it."""
+    with torch.no_grad():
+        color = dtv.render(result.mesh, result.field, cameras[view], (1.0, 1.0, 1.0)).color
+    return color.clamp(0.0, 1.0)
+
+
+def draw(path: str, truth: torch.Tensor, rows: list[Row]) -> None:
+    """A held-out view as photographed and from each fit, and the errors of all cameras."""
+    figure = Figure(figsize=(3.0 * len(rows) + 7.0, 3.4), layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    axes = figure.subplots(1, len(rows) + 2, width_ratios=[*[1.0] * (len(rows) + 1), 1.3])
+    titles = ["photograph", *(f"{row.name}: {row.psnr:.2f} dB" for row in rows)]
+    for place, picture, title in zip(axes, [truth, *(row.picture for row in rows)], titles, strict=False):
+        place.imshow(picture.cpu().numpy(), interpolation="nearest")
+        place.set_title(title, fontsize=10)
+        place.set_axis_off()
+    for row, marker in zip(rows[1:], "x.", strict=False):
+        angles, places = row.errors
+        axes[-1].loglog(angles, 100.0 * places, marker, label=row.name, alpha=0.7)
+    axes[-1].set_xlabel("direction off by, degrees")
+    axes[-1].set_ylabel("position off by, % of the distance")
+    axes[-1].grid(alpha=0.3, which="both")
+    for axis in (axes[-1].xaxis, axes[-1].yaxis):
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter(NullFormatter())
+    axes[-1].legend(fontsize=8)
+    canvas.print_png(path)
 
 
 def main() -> None:
@@ -78,6 +125,7 @@ def main() -> None:
     parser.add_argument("--tested", type=int, default=0, help="held-out views to take; 0: all")
     parser.add_argument("--rates", nargs="+", type=float, default=[CameraRefinement().rate])
     parser.add_argument("--only-refined", action="store_true")
+    parser.add_argument("--figure", help="draw a held-out view of each fit and the errors of its cameras into this PNG")
     options = parser.parse_args()
     capture = dtv.load_capture(options.capture, downscale=options.downscale)
     capture = some_views(capture, options.views, options.tested)
@@ -88,16 +136,23 @@ def main() -> None:
         for rate in options.rates
     ]
     rows = [("true", capture, plain), ("off, as given", off, plain)] if not options.only_refined else []
-    rows += [(f"off, refined at {config.cameras.rate:g}", off, config) for config in refined]
+    names = ["off, refined"] if len(refined) == 1 else [f"off, refined at {rate:g}" for rate in options.rates]
+    rows += [(name, off, config) for name, config in zip(names, refined, strict=True)]
     training = capture.train_indices.tolist()
     print("| poses | PSNR, dB | SSIM | off by, degrees | off by, % of the distance | s |\n|---|---|---|---|---|---|")
+    view, drawn = capture.test_indices.tolist()[0], []
     for name, images, config in rows:
         result = dtv.fit(images, config)
         found = images.cameras if result.refined is None else result.refined.cameras()
-        angle, place = pose_errors(found, capture.cameras, training)
+        errors = pose_errors(found, capture.cameras, training)
+        angle, place = (float(part.mean()) for part in errors)
         psnr, ssim = result.evaluation.mean_psnr, result.evaluation.mean_ssim
         seconds = result.history.seconds
         print(f"| {name} | {psnr:.2f} | {ssim:.4f} | {angle:.3f} | {100 * place:.3f} | {seconds:.0f} |", flush=True)
+        drawn.append(Row(name, psnr, picture_of(result, found, view), errors))
+    if options.figure:
+        image, alpha = capture.images[view], capture.alphas[view]
+        draw(options.figure, image + (1.0 - alpha)[..., None], drawn)
 
 
 if __name__ == "__main__":

@@ -68,3 +68,27 @@ def test_bad_input_is_one_sentence(simulation, tmp_path, capsys, options, senten
 
 def test_a_file_in_the_place_of_the_folder_is_one_sentence(simulation, capsys):
     assert "is a file" in fails(capsys, "viewpoint", simulation, "-o", simulation)
+
+
+def test_an_interrupted_search_is_resumed(simulation, tmp_path, capsys, monkeypatch):
+    from difftetvr.inverse.viewpoint.search import _Look
+
+    folder, climb, climbs = tmp_path / "views", _Look.climb, []
+    command = ["viewpoint", str(simulation), *SEARCH, *SIZE]
+    assert "no unfinished search" in fails(capsys, *command, "-o", folder, "--resume")
+
+    def interrupted(look, pose):
+        climbs.append(pose)
+        if len(climbs) == 2:
+            raise KeyboardInterrupt
+        return climb(look, pose)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(_Look, "climb", interrupted)
+        assert cli.main([*command, "-o", str(folder)]) == 130
+    assert "with --resume goes on" in capsys.readouterr().out
+    assert "has other options" in fails(capsys, *command, "--measure", "both", "-o", folder, "--resume")
+    assert cli.main([*command, "-o", str(folder), "--resume"]) == 0
+    assert cli.main([*command, "-o", str(tmp_path / "whole")]) == 0
+    assert not (folder / "search.json").exists()
+    assert (folder / "views.json").read_bytes() == (tmp_path / "whole" / "views.json").read_bytes()

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 import difftetvr as dtv
+from difftetvr.errors import FitError
 from difftetvr.inverse import (
     ViewpointConfig,
     color_entropy,
@@ -179,3 +180,69 @@ def test_arguments_of_the_wrong_kind_are_errors(blob):
         dtv.best_viewpoint(mesh, field, ViewpointConfig(measure="color"), colors=[1.0, 2.0])
     with pytest.raises(dtv.CameraError, match="number of views"):
         sample_viewpoints(mesh, field, 0)
+
+
+def interrupted_search(blob, path, config, climbs):
+    """A search that is interrupted after some climbs."""
+
+    def stop(done, total):
+        if done == climbs:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        dtv.best_viewpoint(*blob, config, checkpoint=path, on_progress=stop)
+
+
+@pytest.mark.parametrize("climbs", [0, 2])
+def test_a_search_that_was_interrupted_goes_on(blob, tmp_path, climbs):
+    """With what it would have found, and nothing is looked at twice."""
+    config, path = ViewpointConfig(starts=3, scouts=12, measure="both", **SMALL), tmp_path / "search.json"
+    whole = dtv.best_viewpoint(*blob, config)
+    interrupted_search(blob, path, config, climbs)
+    told = []
+    found = dtv.best_viewpoint(
+        *blob, config, checkpoint=path, resume=True, on_progress=lambda *counts: told.append(counts)
+    )
+    assert told == [(done, 3) for done in range(climbs, 4)]
+    assert found.renderings == whole.renderings
+    views = [
+        (*search.found, *search.scouts, *(view for path in search.paths for view in path)) for search in (found, whole)
+    ]
+    assert len(views[0]) == len(views[1])
+    for one, other in zip(*views, strict=True):
+        assert one.entropy == other.entropy
+        assert torch.equal(one.camera.world_to_camera, other.camera.world_to_camera)
+    again = dtv.best_viewpoint(*blob, config, checkpoint=path, resume=True)
+    assert again.best.entropy == whole.best.entropy
+
+
+def test_another_search_does_not_go_on(blob, tmp_path):
+    mesh, field = blob
+    config, path = ViewpointConfig(starts=2, scouts=4, **SMALL), tmp_path / "search.json"
+    interrupted_search(blob, path, config, 1)
+    others = {
+        "options": (mesh, field, ViewpointConfig(starts=2, scouts=5, **SMALL)),
+        "field": (mesh, dtv.Field(field.color, 0.5 * field.density), config),
+        "mesh": (mesh.with_vertices(1.5 * mesh.vertices), field, config),
+    }
+    for scene in others.values():
+        with pytest.raises(FitError, match="of another mesh or field, or has other options"):
+            dtv.best_viewpoint(*scene, checkpoint=path, resume=True)
+    saved = path.read_text()
+    for damaged in (
+        saved[: len(saved) // 2],
+        "[]",
+        "{}",
+        saved.replace('"climbs"', '"clips"'),
+        saved.replace("0.", '"', 1),
+    ):
+        path.write_text(damaged)
+        with pytest.raises(FitError, match=r"cannot be read .*start anew"):
+            dtv.best_viewpoint(mesh, field, config, checkpoint=path, resume=True)
+    path.write_text(saved.replace('"version": 1', '"version": 2'))
+    with pytest.raises(FitError, match="another version"):
+        dtv.best_viewpoint(mesh, field, config, checkpoint=path, resume=True)
+    with pytest.raises(FitError, match="is a folder"):
+        dtv.best_viewpoint(mesh, field, config, checkpoint=tmp_path, resume=True)
+    with pytest.raises(FitError, match="name of a file"):
+        dtv.best_viewpoint(mesh, field, config, checkpoint=3)

@@ -14,7 +14,7 @@ from .transfer.volumes import volume_on_grid as volume_on_grid
 from .viewpoint.entropy import color_entropy as color_entropy
 from .viewpoint.entropy import opacity_entropy as opacity_entropy
 from .viewpoint.entropy import reference_colors as reference_colors
-from .viewpoint.search import Viewpoint as Viewpoint
+from .viewpoint.record import Viewpoint as Viewpoint
 from .viewpoint.search import ViewpointConfig as ViewpointConfig
 from .viewpoint.search import ViewpointSearch as ViewpointSearch
 from .viewpoint.search import best_viewpoint as best_viewpoint

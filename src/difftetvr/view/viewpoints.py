@@ -13,7 +13,8 @@ from matplotlib.figure import Figure
 
 from difftetvr.errors import CaptureError
 from difftetvr.files import atomic_write
-from difftetvr.inverse.viewpoint.search import Viewpoint, ViewpointSearch
+from difftetvr.inverse.viewpoint.record import Viewpoint
+from difftetvr.inverse.viewpoint.search import ViewpointSearch
 
 _LEVELS = 24
 _FEWEST = 8  # views that make a map

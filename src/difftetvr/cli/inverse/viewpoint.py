@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from difftetvr.inverse.viewpoint.search import Viewpoint as View
     from difftetvr.inverse.viewpoint.search import ViewpointConfig, ViewpointSearch
     from difftetvr.rendering import Camera
 
 _FILES = ("best.png", "worst.png", "map.png", "best.json", "worst.json", "views.json")
+_UNFINISHED = "search.json"
 _LARGEST_SEARCH = 4096  # pixels of a side
 
 
@@ -68,6 +68,8 @@ class Viewpoint:
     """How the cells along a ray are found and ordered; default: marching, or linked-list where cells overlap."""
     device: str | None = None
     """Where to render, such as cpu or cuda; default: the best that works."""
+    resume: bool = False
+    """Go on with a search that was interrupted, with the same options."""
     scalars: OmitArgPrefixes[ScalarOptions] = field(default_factory=ScalarOptions)
     mesh: OmitArgPrefixes[MeshOptions] = field(default_factory=MeshOptions)
     trust: OmitArgPrefixes[TrustOptions] = field(default_factory=TrustOptions)
@@ -75,7 +77,7 @@ class Viewpoint:
         "Search": ("measure", "poses", "starts", "scouts", "iterations", "search-size"),
         "Orbit and pictures": ("center", "radius", "up", "fov", "width", "height", "background"),
         "Scalars of a simulation": SCALAR_GROUP,
-        "How it is drawn": ("renderer", "split", "step", "device"),
+        "How it is drawn": ("renderer", "split", "step", "device", "resume"),
         **TRUST_GROUPS,
     }
 
@@ -83,7 +85,7 @@ class Viewpoint:
         """Searches, and fills the output folder."""
         from difftetvr.fitting.beginning.requirements import resolve_device
         from difftetvr.inverse.viewpoint.search import best_viewpoint
-        from difftetvr.terminal import waiting
+        from difftetvr.terminal import counting
 
         background = color_of(self.background)
         self._require_sizes()
@@ -95,9 +97,20 @@ class Viewpoint:
         overlaps = not shown.mesh.is_conforming or data.defects.doubled_places > 0
         config = self._config("linked-list" if overlaps else "marching")
         mesh, content = shown.mesh.to(device=device), shown.field.to(device=device)
-        with waiting(console, f"Looking at {self.model} from {counted(config.scouts or config.starts, 'place')}"):
-            search = best_viewpoint(mesh, content, config)
+        unfinished = self.output / _UNFINISHED
+        if self.resume and not unfinished.exists():
+            raise FitError(f"There is no unfinished search in {self.output}; leave out --resume.")
+        try:
+            with counting(console, f"Climbing to views of {self.model.name}", "climb") as progress:
+                search = best_viewpoint(
+                    mesh, content, config, checkpoint=unfinished, resume=self.resume, on_progress=progress
+                )
+        except KeyboardInterrupt:
+            if unfinished.exists():
+                console.print("Interrupted; the same command with --resume goes on after the last climb.")
+            raise
         self._write(dataclasses.replace(shown, mesh=mesh, field=content), search, config, background)
+        unfinished.unlink(missing_ok=True)
         console.print(_table(search))
         console.print(f"{counted(search.renderings, 'picture')} rendered", highlight=False)
         console.print(f"Wrote {self.output / 'best.png'}; its camera: render --camera {self.output / 'best.json'}")
@@ -151,8 +164,8 @@ class Viewpoint:
             "model": str(self.model),
             "options": dataclasses.asdict(config),
             "renderings": search.renderings,
-            "found": [self._summary(view) for view in search.found],
-            "scouts": [self._summary(view) for view in search.scouts],
+            "found": [view.summary() for view in search.found],
+            "scouts": [view.summary() for view in search.scouts],
         }
         write_json(self.output / "views.json", summary)
 
@@ -161,9 +174,6 @@ class Viewpoint:
         focal = 0.5 * self.height / math.tan(0.5 * math.radians(self.fov))
         width, height = self.width, self.height
         return type(camera)(camera.world_to_camera, focal, focal, 0.5 * width, 0.5 * height, width, height)
-
-    def _summary(self, view: View) -> dict[str, object]:
-        return {"entropy": view.entropy, "world_to_camera": view.camera.world_to_camera.double().cpu().tolist()}
 
 
 def make_folder(folder: Path, names: tuple[str, ...], error: type[DiffTetError] = CaptureError) -> None:

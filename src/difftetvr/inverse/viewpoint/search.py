@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
+import functools
 import math
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from dataclasses import field as dataclass_field
+from pathlib import Path
 from types import NoneType
 from typing import Any, Literal
 
@@ -13,10 +18,12 @@ import torch
 
 from difftetvr.capture.orbit import DEFAULT_FOV_Y
 from difftetvr.declared import require_declared
-from difftetvr.errors import CameraError, MeshError, shown
+from difftetvr.errors import CameraError, FitError, MeshError, shown
+from difftetvr.fitting.records.checkpoint import alone_with
 from difftetvr.inputs import as_whole, require_type
 from difftetvr.inverse.viewpoint.entropy import checked_colors, color_entropy, opacity_entropy, reference_colors
 from difftetvr.inverse.viewpoint.poses import Poses
+from difftetvr.inverse.viewpoint.record import SearchRecord, Viewpoint, problem_of
 from difftetvr.mesh.field import Field
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.rendering import Camera, ScalarField, render
@@ -99,19 +106,6 @@ class ViewpointConfig:
 
 
 @dataclass(frozen=True)
-class Viewpoint:
-    """A camera and the entropy of what it sees.
-
-    Attributes:
-        camera: The camera.
-        entropy: What is measured of its image; greater is better.
-    """
-
-    camera: Camera
-    entropy: float
-
-
-@dataclass(frozen=True)
 class ViewpointSearch:
     """What a search has found.
 
@@ -146,20 +140,24 @@ def best_viewpoint(
     config: ViewpointConfig | None = None,
     *,
     colors: Any = None,
+    checkpoint: str | Path | None = None,
+    resume: bool = False,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> ViewpointSearch:
     """Climbs the entropy of the image over poses of its camera, from several starts.
 
     Each climb goes along the gradient by steps of an adaptive length, a step that does not gain is taken back and
     tried shorter; it ends when steps fall below a thousandth of the distance. All that is random is left out: the same
-    arguments give the same views.
+    arguments give the same views, to the last bit on CPUs, also when the search was interrupted and resumed.
 
     Args:
         mesh: The mesh.
         field: What it holds, see :func:`difftetvr.render`.
         config: What is measured, and from where; default: the opacity's entropy from an orbit.
         colors: (K, 3) colours whose areas are compared; default: :func:`difftetvr.inverse.reference_colors`.
-        on_progress: Called with the number of climbs that have ended, and of all.
+        checkpoint: File (JSON) to which the scouts and every climb that has ended are saved.
+        resume: Go on from ``checkpoint`` if it exists.
+        on_progress: Called with the number of climbs that have ended, and of all; first once the scouts are rendered.
 
     Returns:
         The views found, the best first.
@@ -167,14 +165,22 @@ def best_viewpoint(
     Raises:
         CameraError: Nothing is seen from any start, or a colour is wanted where there is none.
         MeshError: See :func:`difftetvr.render`.
+        FitError: The checkpoint cannot be used.
     """
-    look = _Look.of(mesh, field, config, colors)
-    starts = look.starts()
-    climbs = []
-    for index, start in enumerate(starts):
-        climbs.append(look.climb(start))
-        if on_progress is not None:
-            on_progress(index + 1, len(starts))
+    require_type(checkpoint, (str, os.PathLike, NoneType), "checkpoint", "pass the name of a file", FitError)
+    look, path = _Look.of(mesh, field, config, colors), None if checkpoint is None else Path(checkpoint)
+    climbs: list[list[Viewpoint]] = []
+    with alone_with(path) if path is not None else contextlib.nullcontext():
+        if path is not None and resume and path.exists():
+            climbs = look.resumed(path)
+        starts = look.starts()
+        for count in range(len(climbs), len(starts) + 1):
+            if count > len(climbs):
+                climbs.append(look.climb(starts[count - 1]))
+            if path is not None:
+                look.record(climbs).save(path)
+            if on_progress is not None:
+                on_progress(count, len(starts))
     look.require_anything()
     climbs.sort(key=lambda path: -path[-1].entropy)
     found = tuple(path[-1] for path in climbs)
@@ -247,7 +253,8 @@ class _Look:
         return _Look(mesh, field, chosen, chosen.poses_about(mesh), references)
 
     def entropy(self, camera: Camera) -> torch.Tensor:
-        image = render(self.mesh, self.field, camera, renderer=self.config.renderer)
+        on_cpu = self.mesh.vertices.is_cpu
+        image = render(self.mesh, self.field, camera, renderer=self.config.renderer, deterministic=on_cpu)
         self.renderings += 1
         self.most_seen = max(self.most_seen, float(image.alpha.detach().max()))
         total = image.alpha.new_zeros(())
@@ -275,7 +282,7 @@ class _Look:
             return self.poses.starts(count)
         scouts = self.poses.spread(self.config.scouts)
         with torch.no_grad():
-            self.scouts += [self.view(pose)[0] for pose in scouts]
+            self.scouts += [self.view(pose)[0] for pose in scouts[len(self.scouts) :]]
         order = sorted(range(len(scouts)), key=lambda scout: -self.scouts[scout].entropy)
         # Each scout stands for its share of the sphere; best ones side by side would climb one hill.
         apart = 2.0 * _APART / math.sqrt(len(scouts))
@@ -285,6 +292,24 @@ class _Look:
                 chosen.append(scout)
         rest = [scout for scout in order if scout not in chosen]
         return [scouts[scout] for scout in (chosen + rest)[:count]]
+
+    @functools.cached_property
+    def problem(self) -> str:
+        """What tells this search from others."""
+        return problem_of(self.mesh, self.field, dataclasses.asdict(self.config), self.references)
+
+    def record(self, climbs: list[list[Viewpoint]]) -> SearchRecord:
+        """What has been found so far."""
+        return SearchRecord(self.problem, self.renderings, self.most_seen, self.scouts, climbs)
+
+    def resumed(self, path: Path) -> list[list[Viewpoint]]:
+        """The climbs of an earlier search, whose scouts are taken over."""
+        saved = SearchRecord.load(path, self.poses.camera(self.poses.spread(1)[0]))
+        saved.require(self.problem, path)
+        if len(saved.scouts) != self.config.scouts or len(saved.climbs) > self.config.starts:
+            raise FitError(f"The search in {path} does not fit its own options; start anew.")
+        self.renderings, self.most_seen, self.scouts = saved.renderings, saved.most_seen, saved.scouts
+        return saved.climbs
 
     def climb(self, pose: torch.Tensor) -> list[Viewpoint]:
         """The views from a start uphill."""

@@ -1,0 +1,139 @@
+"""What a search of views has found so far, in a file, so that one that was interrupted goes on."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from difftetvr.errors import DiffTetError, FitError
+from difftetvr.fitting.records.checkpoint import require_no_folder
+from difftetvr.fitting.records.folder import write_json
+from difftetvr.mesh.field import Field
+from difftetvr.mesh.tetmesh import TetMesh
+from difftetvr.rendering import Camera, ScalarField
+
+_VERSION = 1
+
+
+@dataclass(frozen=True)
+class Viewpoint:
+    """A camera and the entropy of what it sees.
+
+    Attributes:
+        camera: The camera.
+        entropy: What is measured of its image; greater is better.
+    """
+
+    camera: Camera
+    entropy: float
+
+    def summary(self) -> dict[str, Any]:
+        """Both as JSON holds them, to the last bit."""
+        return {"entropy": self.entropy, "world_to_camera": self.camera.world_to_camera.double().cpu().tolist()}
+
+
+@dataclass
+class SearchRecord:
+    """A search between two climbs.
+
+    Attributes:
+        problem: What tells it from others, see :func:`problem_of`.
+        renderings: Images that were rendered.
+        most_seen: Greatest opacity in any of them.
+        scouts: Views that were rendered first, all of them.
+        climbs: Views of each climb that has ended, from its start to its end.
+    """
+
+    problem: str
+    renderings: int
+    most_seen: float
+    scouts: list[Viewpoint]
+    climbs: list[list[Viewpoint]]
+
+    def save(self, path: Path) -> None:
+        """Writes it, whole or not at all.
+
+        Raises:
+            FitError: The file cannot be written.
+        """
+        state = {
+            "version": _VERSION,
+            "problem": self.problem,
+            "renderings": self.renderings,
+            "most_seen": self.most_seen,
+            "scouts": [view.summary() for view in self.scouts],
+            "climbs": [[view.summary() for view in climb] for climb in self.climbs],
+        }
+        write_json(path, state)
+
+    @staticmethod
+    def load(path: Path, like: Camera) -> SearchRecord:
+        """Reads it.
+
+        Args:
+            path: Its file.
+            like: A camera whose intrinsics all views have.
+
+        Raises:
+            FitError: The file is missing, damaged or of another version.
+        """
+        require_no_folder(path)
+        try:
+            state = json.loads(path.read_text())
+            if state.pop("version") != _VERSION:
+                raise FitError(f"The search in {path} is of another version of this program; start anew.")
+            scouts = [_view(view, like) for view in state.pop("scouts")]
+            climbs = [[_view(view, like) for view in climb] for climb in state.pop("climbs")]
+            if not all(climbs):
+                raise ValueError
+            found = SearchRecord(scouts=scouts, climbs=climbs, **state)
+            found.renderings, found.most_seen = int(found.renderings), float(found.most_seen)
+        except FitError:
+            raise
+        except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError, DiffTetError) as error:
+            reason = error.strerror if isinstance(error, OSError) else "it is no record of a search"
+            raise FitError(f"The search in {path} cannot be read ({reason}); start anew.") from error
+        return found
+
+    def require(self, problem: str, path: Path) -> None:
+        """Checks that a search goes on with what it began with.
+
+        Raises:
+            FitError: It was something else.
+        """
+        if self.problem != problem:
+            raise FitError(
+                f"The search in {path} is of another mesh or field, or has other options; go on with the same or start "
+                "anew."
+            )
+
+
+def problem_of(mesh: TetMesh, field: Field | ScalarField, options: dict[str, Any], colors: torch.Tensor | None) -> str:
+    """What tells a search from others: a SHA-256 of all that decides what is found."""
+    parts: list[torch.Tensor] = [mesh.vertices, mesh.tets, *field.arrays().values()]
+    numbers: list[Any] = [options, field.location, list(mesh.origin)]
+    if isinstance(field, ScalarField):
+        function = field.transfer_function
+        parts += [function.scalar, function.opacity, function.color]
+        numbers += [field.attenuation, field.value_range]
+    return _digest(numbers, [*parts, *([] if colors is None else [colors])])
+
+
+def _digest(numbers: list[Any], tensors: Iterable[torch.Tensor]) -> str:
+    digest = hashlib.sha256(json.dumps(numbers).encode())
+    for tensor in tensors:
+        values = tensor.detach().cpu().contiguous()
+        digest.update(f"{values.dtype} {tuple(values.shape)}".encode())
+        digest.update(values.reshape(-1).numpy().data)
+    return digest.hexdigest()
+
+
+def _view(summary: dict[str, Any], like: Camera) -> Viewpoint:
+    pose = torch.tensor(summary["world_to_camera"], dtype=torch.float64)
+    return Viewpoint(like.with_pose(pose), float(summary["entropy"]))
