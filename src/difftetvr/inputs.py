@@ -110,6 +110,6 @@ def handed_over(tensor: torch.Tensor, like: torch.Tensor, dtype: torch.dtype | N
     dtype = like.dtype if dtype is None else dtype
     if tensor.device.type != "cpu" or like.device.type != "cuda":
         return tensor.to(dtype).to(like.device)  # in this order: not all devices know float64
-    is_large = tensor.numel() * tensor.element_size() > _MOST_AT_ONCE
+    is_large = tensor.numel() * dtype.itemsize > _MOST_AT_ONCE
     copy = torch.empty(tensor.shape, dtype=dtype, pin_memory=is_large).copy_(tensor)
     return copy.to(like.device, non_blocking=True)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
 import pytest
 import torch
 
+from difftetvr.errors import CameraError
 from difftetvr.rendering import LensCamera
 
 SIZE, INTRINSICS = (320, 240), (300.0, 280.0, 161.0, 118.0)
@@ -186,3 +188,26 @@ def test_no_distortion_is_none() -> None:
     equidistant = LensCamera(torch.eye(4), *INTRINSICS, *SIZE, model="fisheye", coefficients=torch.zeros(0))
     zeros = LensCamera(torch.eye(4), *INTRINSICS, *SIZE, model="fisheye", coefficients=torch.zeros(4))
     assert torch.equal(equidistant.ray_directions(), zeros.ray_directions())
+
+
+@pytest.mark.parametrize(
+    ("model", "coefficients"),
+    [("eucm", [0.6, 1.2]), ("fov", [1.2]), ("division", [-0.8]), ("fisheye", [-0.05]), ("opencv", [-0.3, 0.02])],
+)
+def test_rays_to_the_rim_of_a_lens_that_ends_inside_the_image_are_projected_to_their_pixels(
+    model: str, coefficients: list[float]
+) -> None:
+    values = torch.tensor(coefficients, dtype=torch.float64)
+    camera = LensCamera(torch.eye(4), 75.0, 75.0, 120.0, 90.0, 240, 180, model=model, coefficients=values)
+    directions = camera.ray_directions()
+    known = torch.isfinite(directions).all(-1)
+    rows, columns = torch.nonzero(known).T
+    assert 0 < len(rows) < known.numel()
+    expected = torch.stack([columns, rows], 1) + 0.5
+    torch.testing.assert_close(camera.project(directions[known])[0], expected.double(), rtol=0.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("omega", [math.pi, -math.pi, 4.0])
+def test_fields_of_view_of_half_a_turn_and_more_are_refused(omega: float) -> None:
+    with pytest.raises(CameraError, match="must lie between -pi and pi"):
+        LensCamera(torch.eye(4), *INTRINSICS, *SIZE, model="fov", coefficients=[omega])

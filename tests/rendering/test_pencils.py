@@ -160,3 +160,26 @@ def test_rays_through_vertices_and_edges(mesh: str) -> None:
     origins = middle + 2.0 * torch.randn(len(targets), 3, generator=generator, dtype=torch.float64)
     origins, directions = (part.repeat_interleave(pencils.RAYS, 0) for part in (origins, targets - origins))
     assert checked(it, Rays(origins, directions)).any()
+
+
+@pytest.mark.parametrize(
+    ("dtype", "scale", "far"),
+    [
+        (torch.float32, 1.0, 1e20),
+        (torch.float32, 1.0, 1e38),
+        (torch.float32, 1e-20, 1.0),
+        (torch.float64, 1.0, 1e160),
+        (torch.float64, 1.0, 1e300),
+    ],
+)
+def test_a_ray_that_passes_far_away_takes_no_other_with_it(dtype: torch.dtype, scale: float, far: float) -> None:
+    mesh = TetMesh.grid((2, 2, 2), dtype=dtype)
+    mesh = mesh.with_vertices(scale * mesh.vertices)
+    field = Field(torch.ones(27, 3, dtype=dtype), torch.ones(27, dtype=dtype) / scale)
+    origins = scale * torch.tensor([[0.3, 0.4, -2.0]], dtype=torch.float64).repeat(16, 1)
+    directions = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64).repeat(16, 1)
+    origins[3, :2] = far
+    image = render(mesh, field, Rays(origins, directions)).color
+    alone = render(mesh, field, Rays(origins[:1], directions[:1])).color
+    assert bool((image[3] == 0).all()) and bool((alone > 0.5).all())
+    assert torch.equal(image[torch.arange(16) != 3], alone.expand(15, 3))

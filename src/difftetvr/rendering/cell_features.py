@@ -22,8 +22,8 @@ class CellFeatures:
     colours do not count. Gradients reach the features, the density, and a transfer function's knots.
 
     Attributes:
-        features: (T, C) channels of each cell, 0 to 64 of them, of any sign; float32 or float64, finite when they are
-            rendered; may require grad.
+        features: (T, C) channels of each cell, 0 to 64 of them, of any sign; float32 or float64, finite where they are
+            seen; may require grad.
         medium: The field whose density absorbs.
 
     Raises:
@@ -45,16 +45,17 @@ class CellFeatures:
             self.medium, (Field, ScalarField), "The medium", "pass a difftetvr.Field or ScalarField", MeshError
         )
 
-    def validate(self) -> None:
-        """Check that all features are finite, which rendering asks for where something is not.
+    def validate(self, mesh: TetMesh) -> None:
+        """Check that all features are finite at the precision of a mesh, as rendering does where something is not.
 
         Raises:
             MeshError: One is not; names the first such cell.
         """
-        finite = torch.isfinite(self.features.detach()).all(1)
+        features = self.features.detach().to(mesh.vertices.dtype)
+        finite = torch.isfinite(features).all(1)
         if not bool(finite.all()):
             cell = int(torch.nonzero(~finite)[0])
-            values = shown(self.features[cell])
+            values = shown(features[cell].tolist())
             raise MeshError(f"The features of cell {cell} are {values}; make every feature finite.")
 
     def location_on(self, mesh: TetMesh) -> Location:

@@ -71,7 +71,10 @@ def _plane(plane: Any, like: torch.Tensor, origin: Sequence[float]) -> tuple[tor
     values = exact.detach()
     if values.shape != (4,) or not bool(torch.isfinite(values).all()) or not bool(values[:3].any()):
         raise DiffTetError(f"clip_plane is {shown(plane)}; {_FINITE}.")
-    coefficients = handed_over(exact, like)
+    # In another unit, a power of two, so that no precision is too small for them.
+    exact = torch.ldexp(exact, -torch.frexp(values[:3].abs().amax()).exponent)
+    farthest = torch.finfo(like.dtype).max
+    coefficients = handed_over(torch.cat((exact[:3], exact[3:].clamp(-farthest, farthest))), like)
     offset = coefficients[3]
     if any(origin):
         exact, shift = exact.cpu(), torch.tensor(list(origin), dtype=torch.float64)

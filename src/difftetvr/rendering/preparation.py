@@ -162,7 +162,7 @@ def prepare_view(
     view = _laid_out(task, shape, passed)
     if not _is_common(view):
         if not view.laid_out.extent.is_sound and not isinstance(given, ScalarField):
-            given.validate(*((mesh,) if isinstance(given, Field) else ()))
+            given.validate(mesh)
         task, passed = _uncommon(task, passed)
         view = _laid_out(task, shape, passed)
     return view if viewpoint is None else replace(view, viewpoint=viewpoint)

@@ -152,17 +152,21 @@ def test_lenses_that_nerfstudio_lists(tmp_path: Path) -> None:
     content["frames"][2] |= {"distortion_params": [-0.1, 0.0, 0.0, 0.0, 0.02, 0.0]}
     content["frames"][3] |= {"is_fisheye": True, "distortion_params": [-0.1, 0.02, 0.0, 0.01, 0.0, 0.0]}
     content["frames"][4] |= {"distortion_params": None, "k4": 0.02}
+    content["frames"][5] |= {"k1": 0.25}  # its own, not the list of all
+    content["frames"][6] |= {"is_fisheye": True, "camera_model": "FISHEYE624", "distortion_params": aria}
     dump(tmp_path / "transforms.json", content)
     capture = load_capture(tmp_path, keep_lens=True)
     capture.save(tmp_path / "c.npz")
     for cameras in (capture.cameras, load_capture(tmp_path / "c.npz").cameras):
-        lenses = [(camera.model, camera.coefficients.tolist()) for camera in cameras[:5]]  # type: ignore[attr-defined]
+        lenses = [(camera.model, camera.coefficients.tolist()) for camera in cameras[:7]]  # type: ignore[attr-defined]
         assert lenses == [
             ("nerfstudio", [-0.1, 0.02, 0.0, 0.03, 0.01, 0.0]),
             ("rad-tan-thin-prism-fisheye", aria),
             ("opencv", [-0.1, 0.0, 0.02, 0.0, 0.0]),
             ("fisheye", [-0.1, 0.02, 0.0, 0.01]),
             ("nerfstudio", [0.5, 0.0, 0.0, 0.02, 0.0, 0.0]),
+            ("opencv", [0.25, 0.0, 0.0, 0.0, 0.0]),
+            ("rad-tan-thin-prism-fisheye", aria),
         ]
 
 

@@ -321,6 +321,20 @@ def test_clipping_everything_leaves_the_background() -> None:
     assert float(image.alpha.max()) == 0.0
 
 
+@pytest.mark.parametrize("factor", [1e-300, 1e-50, 3.0, 1e40, 1e300])
+@pytest.mark.parametrize("as_rays", [False, True])
+def test_planes_in_any_unit(factor: float, as_rays: bool) -> None:
+    """Four numbers and their multiples are one plane, whatever float32 holds of them."""
+    scene = SCENES["delaunay"]()
+    mesh, field = TetMesh(scene.vertices, scene.tets), Field(scene.color, scene.density)
+    camera = scene.camera.rays() if as_rays else scene.camera
+    expected, found = (
+        render(mesh, field, camera, clip_plane=[part * unit for part in PLANE]) for unit in (1.0, factor)
+    )
+    assert torch.allclose(found.color, expected.color, atol=2e-6) and bool(expected.color.any())
+    assert not bool(render(mesh, field, camera, clip_plane=(0.0, 0.0, factor, -1e308)).alpha.any())
+
+
 @pytest.mark.parametrize("plane", [(0, 0, 0, 1), (1, 2, 3), (float("nan"), 0, 1, 0), "up"])
 def test_bad_planes(plane: object) -> None:
     with pytest.raises(DiffTetError, match="clip_plane"):

@@ -101,7 +101,13 @@ def widest_radius(lens: Intrinsics) -> float:
     """The greatest length of undistorted coordinates that are seen in the image; 0 where none are."""
     sides = (torch.linspace(0, side, min(side + 1, _EDGE), dtype=torch.float64) for side in (lens.width, lens.height))
     radii = lens.distortion.undistort(lens.to_normalised(_grid(*sides))).norm(dim=-1)
-    return float(torch.nan_to_num(radii).max())
+    if not bool(torch.isfinite(radii).all()):
+        # The lens ends inside the image, and just there it sees farthest.
+        view = field_of_view(lens)
+        if not bool(view.known.any()):
+            return 0.0
+        radii = lens.distortion.coordinates(view.directions[view.known])[0].norm(dim=-1)
+    return float(radii.max())
 
 
 def _grid(across: torch.Tensor, down: torch.Tensor) -> torch.Tensor:

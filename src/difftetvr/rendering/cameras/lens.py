@@ -49,6 +49,8 @@ class LensCamera(Camera):
     - ``"rad-tan-thin-prism-fisheye"``, also called Fisheye624: k0 to k5 (here k1 to k6), p0, p1 (p2, p1), s0 to s3
       (s1 to s4); all that is not g is of g u and g v instead of u and v.
 
+    Lenses that are no fisheyes see nothing at right angles to the axis or behind.
+
     Sources: OpenCV's manual, modules calib3d and fisheye; https://colmap.github.io/cameras.html and COLMAP's
     sensor/models; cameras/camera_utils.py of nerfstudio.
 
@@ -57,7 +59,8 @@ class LensCamera(Camera):
         coefficients: (N,) as above; images are differentiable in them.
 
     Raises:
-        CameraError: As of `Camera`, or the model is unknown, or has another number of coefficients.
+        CameraError: As of `Camera`, or the model is unknown, or has another number of coefficients, or omega is out of
+            range.
     """
 
     model: str = "opencv"
@@ -74,6 +77,8 @@ class LensCamera(Camera):
             raise CameraError(f"The lens has {len(values)} coefficients; the model '{self.model}' takes {given}.")
         if not bool(torch.isfinite(values.detach()).all()):
             raise CameraError("A coefficient of the lens is not finite; give finite numbers.")
+        if self.model == "fov" and not bool(values.detach().abs() < math.pi):
+            raise CameraError(f"The field of view omega is {float(values[0])} radians; it must lie between -pi and pi.")
         object.__setattr__(self, "coefficients", values)
 
     def ray_directions(self) -> torch.Tensor:

@@ -18,7 +18,7 @@ from difftetvr.backend import Backend
 from difftetvr.rendering.search.beams import Beam, Spread
 from difftetvr.rendering.search.hierarchy import Hierarchy
 from difftetvr.rendering.search.scene import Scene
-from difftetvr.rendering.traversal.rays import Lanes
+from difftetvr.rendering.traversal.rays import Lanes, largest_coordinate
 
 Seen = Callable[[Any], tuple[Lanes, Any, Any]]
 """Rays of lanes, and the distances between which they are looked at."""
@@ -31,6 +31,9 @@ ROOM_FOR_BLOCKS = 64
 
 ROOM = 96
 """For items that a pencil may meet; to try more would take each ray as long as a search of its own."""
+
+_FARTHEST = 1e12
+"""Greatest coordinate of a pencil's origins: products of such, as float32, do not overflow."""
 
 
 @dataclass
@@ -69,9 +72,11 @@ class Pencils:
             dr.scatter(blocks, number, ROOM_FOR_BLOCKS * pencil + count, count < ROOM_FOR_BLOCKS)
             return count + 1
 
+        is_wide = largest_coordinate([list(beam.farthest)]) > _FARTHEST
+        beam.valid &= ~is_wide
         met = hierarchy.meet_blocks(beam, at_block, dr.zeros(uint, number), lambda count: count > ROOM_FOR_BLOCKS)
-        dr.eval(blocks, met)
-        is_many = met > ROOM_FOR_BLOCKS
+        dr.eval(blocks, met, is_wide)
+        is_many = is_wide | (met > ROOM_FOR_BLOCKS)
         end, entry = dr.select(is_many, 0, block * met), _Entry.of(scene, beam, hierarchy)
 
         def body(place: Any, count: Any) -> tuple[Any, Any]:

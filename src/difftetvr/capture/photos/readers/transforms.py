@@ -35,8 +35,10 @@ from difftetvr.rendering.cameras.lenses.models import LENS_MODELS, TRANSFORMS_CA
 from difftetvr.trust import file_beside
 
 _FISHEYE = "OPENCV_FISHEYE"  # what is_fisheye of instant-ngp stands for
+_READ = {kind.model for kinds in TRANSFORMS_CAMERAS.values() for kind in kinds}
+# Of any lens that such a file is read with, or that its distortion may be taken for.
 _COEFFICIENTS = sorted(
-    {name for kinds in TRANSFORMS_CAMERAS.values() for kind in kinds for name in LENS_MODELS[kind.model].coefficients}
+    {name for model in (*_READ, "thin-prism-fisheye", "fov") for name in LENS_MODELS[model].coefficients}
 )
 # What changes nothing here, although the file says it.
 _UNUSED = {
@@ -135,8 +137,16 @@ def _views(file: Path, content: dict[str, Any], is_test: bool) -> list[View]:
         root, name = image_place(file, text_of(frame, "file_path", where), where)
         pose = from_opengl(frame.get("transform_matrix"), where)
         mask = file_beside(file, text_of(frame, "mask_path", where), CaptureError) if frame.get("mask_path") else None
-        views.append(View(file, root, name, pose, _lens({**content, **frame}, where), is_test, mask))
+        views.append(View(file, root, name, pose, _lens(_values_of(content, frame), where), is_test, mask))
     return views
+
+
+def _values_of(content: dict[str, Any], frame: dict[str, Any]) -> dict[str, Any]:
+    """What holds for a frame: its own values before those at the top, coefficients of its own before a list there."""
+    values = {**content, **frame}
+    if "distortion_params" not in frame and any(key in frame for key in _COEFFICIENTS):
+        values.pop("distortion_params", None)
+    return values
 
 
 def _lens(values: dict[str, Any], where: str) -> Lens:
@@ -146,7 +156,9 @@ def _lens(values: dict[str, Any], where: str) -> Lens:
             f"The camera model of {where} is {shown(model)}, which is not known; undistort its images to a pinhole "
             "first."
         )
-    kinds = TRANSFORMS_CAMERAS[_FISHEYE if values.get("is_fisheye") else model.upper()]
+    kinds = TRANSFORMS_CAMERAS[model.upper()]
+    if values.get("is_fisheye") and not LENS_MODELS[kinds[-1].model].is_fisheye:
+        kinds = TRANSFORMS_CAMERAS[_FISHEYE]
 
     def number(key: str) -> float | None:
         return number_of(values, key, where)
@@ -180,7 +192,8 @@ def _distortion_params(values: dict[str, Any], kind: FileCamera, where: str) -> 
     listed = values.get("distortion_params")
     if listed is None:
         return None
-    numbers = numbers_of(listed)
+    is_plain = isinstance(listed, list) and all(type(value) in (int, float) for value in listed)
+    numbers = numbers_of(listed if is_plain else None)
     names = max(kind.parameters, LENS_MODELS["nerfstudio"].coefficients, key=len)
     if numbers.shape != (len(names),) or not np.isfinite(numbers).all():
         raise CaptureError(

@@ -37,9 +37,9 @@ LENS_MODELS = {
         ("k1", "k2", "k3", "k4", "p1", "p2"),
         (2, 6),
     ),
-    "fov": LensModel(("omega",), ("omega",), (1,), profile="field of view"),
+    "fov": LensModel(("omega",), ("omega",), (1,), profile="fov"),
     "division": LensModel(("k",), ("k",), (1,), profile="division"),
-    "eucm": LensModel(("alpha", "beta"), ("alpha", "beta"), (2,), profile="unified"),
+    "eucm": LensModel(("alpha", "beta"), ("alpha", "beta"), (2,), profile="eucm"),
     "fisheye": LensModel(("k1", "k2", "k3", "k4"), ("k1", "k2", "k3", "k4"), (0, 1, 2, 4), is_fisheye=True),
     "thin-prism-fisheye": LensModel(
         ("k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1"),

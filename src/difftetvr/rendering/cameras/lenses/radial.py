@@ -39,7 +39,7 @@ def as_tensor(value: Any, like: torch.Tensor) -> torch.Tensor:
 
 
 def rational(r2: torch.Tensor, c: Coefficients) -> tuple[Any, Any]:
-    """(1 + k1 r2 + ... + k6 r2^6) / (1 + d1 r2 + d2 r2^2 + d3 r2^3)."""
+    """(1 + k1 r2 + ... + k6 r2^6) / (1 + d1 r2 + d2 r2^2 + d3 r2^3), by the names of `LensModel.terms`."""
     above, above_slope = _series(r2, [c[name] for name in ("k1", "k2", "k3", "k4", "k5", "k6") if name in c])
     below, below_slope = _series(r2, [c[name] for name in ("d1", "d2", "d3") if name in c])
     g = above / below
@@ -96,9 +96,9 @@ def _guess_of_unified(s2: torch.Tensor, c: Coefficients) -> torch.Tensor:
 
 PROFILES = {
     "rational": Profile(rational, None),
-    "field of view": Profile(field_of_view, _guess_of_field),
+    "fov": Profile(field_of_view, _guess_of_field),
     "division": Profile(division, _guess_of_division),
-    "unified": Profile(unified, _guess_of_unified),
+    "eucm": Profile(unified, _guess_of_unified),
 }
 """Families by name."""
 
