@@ -28,6 +28,7 @@ CELLS_OF_A_LEAF = 2
 _CURVE_BITS = 20  # of each coordinate
 
 _BLOCK_LEVELS = 2
+"""Levels above the leaves at which pencils of rays stop: they try four items at a time."""
 
 _LEVELS = 3
 """Levels of a hierarchy that a kernel makes of the one below them."""

@@ -15,6 +15,7 @@ from typing import Any
 import drjit as dr
 
 from difftetvr.backend import Backend
+from difftetvr.mesh.shapes import cross
 from difftetvr.rendering.search.beams import Beam, Spread
 from difftetvr.rendering.search.hierarchy import Hierarchy
 from difftetvr.rendering.search.scene import Scene
@@ -72,7 +73,7 @@ class Pencils:
             dr.scatter(blocks, number, ROOM_FOR_BLOCKS * pencil + count, count < ROOM_FOR_BLOCKS)
             return count + 1
 
-        is_wide = largest_coordinate([list(beam.farthest)]) > _FARTHEST
+        is_wide = beam.valid & ~(largest_coordinate([list(beam.farthest)]) <= _FARTHEST)
         beam.valid &= ~is_wide
         met = hierarchy.meet_blocks(beam, at_block, dr.zeros(uint, number), lambda count: count > ROOM_FOR_BLOCKS)
         dr.eval(blocks, met, is_wide)
@@ -145,7 +146,7 @@ class _Entry:
         for p, q in zip(places, places[1:] + places[:1], strict=True):
             is_met &= self._may_be_left(p, q)
             rounding += self.margin * (_length(p) + _length(q))
-        outward = _cross(_between(places[0], places[1]), _between(places[0], places[2]))
+        outward = cross(_between(places[0], places[1]), _between(places[0], places[2]))
         facing = rounding
         for d, turn, part in zip(self.beam.direction, self.spread.direction, outward, strict=True):
             facing = dr.fma(d, part, dr.fma(turn, dr.abs(part), facing))
@@ -153,8 +154,8 @@ class _Entry:
 
     def _may_be_left(self, p: list[Any], q: list[Any]) -> Any:
         d, ways, turns = self.beam.direction, self.spread.origin, self.spread.direction
-        edge, normal = _between(p, q), _cross(p, q)
-        across, most = _cross(edge, list(d)), self.margin * (_length(p) + _length(q))
+        edge, normal = _between(p, q), cross(p, q)
+        across, most = cross(edge, list(d)), self.margin * (_length(p) + _length(q))
         for axis, (j, k) in enumerate(((1, 2), (2, 0), (0, 1))):
             swing = dr.fma(dr.abs(edge[j]), turns[k], dr.abs(edge[k]) * turns[j])
             most = dr.fma(d[axis], normal[axis], dr.fma(turns[axis], dr.abs(normal[axis]), most))
@@ -164,10 +165,6 @@ class _Entry:
 
 def _between(p: list[Any], q: list[Any]) -> list[Any]:
     return [b - a for a, b in zip(p, q, strict=True)]
-
-
-def _cross(p: list[Any], q: list[Any]) -> list[Any]:
-    return [p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0]]
 
 
 def _length(p: list[Any]) -> Any:
