@@ -72,7 +72,9 @@ def _plane(plane: Any, like: torch.Tensor, origin: Sequence[float]) -> tuple[tor
     if values.shape != (4,) or not bool(torch.isfinite(values).all()) or not bool(values[:3].any()):
         raise DiffTetError(f"clip_plane is {shown(plane)}; {_FINITE}.")
     # In another unit, a power of two, so that no precision is too small for them.
-    exact = torch.ldexp(exact, -torch.frexp(values[:3].abs().amax()).exponent)
+    most = 120 if exact.dtype == torch.float32 else 1000
+    exponent = torch.frexp(values[:3].abs().amax()).exponent.clamp(-most, most)
+    exact = exact * torch.ldexp(torch.ones_like(values[0]), -exponent)
     farthest = torch.finfo(like.dtype).max
     coefficients = handed_over(torch.cat((exact[:3], exact[3:].clamp(-farthest, farthest))), like)
     offset = coefficients[3]

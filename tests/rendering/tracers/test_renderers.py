@@ -261,7 +261,7 @@ def test_faces_beside_the_camera_are_not_sought_in_the_whole_image() -> None:
 
 # ------------------------------------------------------------------------------------------------------ clip planes
 
-PLANE = (0.3, -0.5, 0.8, 0.05)
+PLANE = (0.6, -1.0, 1.6, 0.1)
 
 
 @pytest.mark.parametrize("renderer", RENDERERS)
