@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from difftetvr.rendering.gauss_newton import ImageModel
 
 USUAL_VIEWS = 12
-"""Views that a refinement is judged on where nobody says how many."""
+"""Views that a refinement is judged on where a strategy does not say how many."""
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ class Strategy(Protocol):
 
     @property
     def views(self) -> int | None:
-        """Training views on which a refinement is judged; None: :data:`USUAL_VIEWS`."""
+        """Training views on which a refinement is judged; None: 12."""
         ...
 
     def initial_cells(self, budget: int) -> int:
