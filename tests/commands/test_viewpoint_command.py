@@ -87,6 +87,8 @@ def test_an_interrupted_search_is_resumed(simulation, tmp_path, capsys, monkeypa
         patch.setattr(_Look, "climb", interrupted)
         assert cli.main([*command, "-o", str(folder)]) == 130
     assert "with --resume goes on" in capsys.readouterr().out
+    assert "--overwrite or another folder" in fails(capsys, *command, "-o", folder)
+    assert "one of --resume and --overwrite" in fails(capsys, *command, "-o", folder, "--resume", "--overwrite")
     assert "has other options" in fails(capsys, *command, "--measure", "both", "-o", folder, "--resume")
     assert cli.main([*command, "-o", str(folder), "--resume"]) == 0
     assert cli.main([*command, "-o", str(tmp_path / "whole")]) == 0

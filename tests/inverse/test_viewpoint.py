@@ -1,5 +1,6 @@
 """Entropies of images, and views that have more of it than any that were sampled."""
 
+import json
 import math
 
 import pytest
@@ -246,3 +247,24 @@ def test_another_search_does_not_go_on(blob, tmp_path):
         dtv.best_viewpoint(mesh, field, config, checkpoint=tmp_path, resume=True)
     with pytest.raises(FitError, match="name of a file"):
         dtv.best_viewpoint(mesh, field, config, checkpoint=3)
+    path.write_text(json.dumps(json.loads(saved) | {"most_seen": 0.5}))
+    with pytest.raises(FitError, match="damaged"):
+        dtv.best_viewpoint(mesh, field, config, checkpoint=path, resume=True)
+    dear = tmp_path / "dear.json"
+    dear.write_text('{"mine": 1}')
+    with pytest.raises(FitError, match="no record of a search"):
+        dtv.best_viewpoint(mesh, field, config, checkpoint=dear)
+    assert dear.read_text() == '{"mine": 1}'
+
+
+@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
+def test_climbs_follow_gradients_that_are_switched_off_around_them(blob, mode, tmp_path):
+    mesh, field = blob
+    config, path = ViewpointConfig(starts=2, scouts=4, up=(0, 0, 1), **SMALL), tmp_path / "search.json"
+    expected = dtv.best_viewpoint(mesh, field, config, checkpoint=path)
+    with mode():
+        found = dtv.best_viewpoint(mesh, field, config)
+    assert found.best.entropy == expected.best.entropy and found.renderings == expected.renderings
+    # The same options in other words are the same.
+    same = ViewpointConfig(starts=2, scouts=4, up=(0.0, 0.0, 1.0), **SMALL)
+    assert dtv.best_viewpoint(mesh, field, same, checkpoint=path, resume=True).best.entropy == expected.best.entropy

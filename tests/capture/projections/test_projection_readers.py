@@ -279,3 +279,23 @@ def test_announced_sizes_are_held_against_memory(tmp_path):
         file.create_dataset("line_integrals", (10**5, 10**4, 10**4), "f4", chunks=(1, 64, 64), compression="gzip")
     with pytest.raises(CaptureError, match=r"would take .* of memory can be used"):
         ProjectionCapture.load(tmp_path / "a.h5")
+
+
+@pytest.mark.parametrize(
+    ("changed", "sentence"),
+    [
+        ({"valid": np.full((3, 6), 0.5)}, "mask 'valid' .* more than 0 and 1"),
+        ({"valid": np.full((3, 6), np.nan)}, "mask 'valid' .* more than 0 and 1"),
+        ({"Valid": np.ones((3, 6), bool)}, "'Valid', which is no array of a scan; rename or remove it"),
+        ({"mask": np.ones((3, 6), bool)}, "'mask', which is no array of a scan"),
+    ],
+)
+def test_masks_that_would_be_passed_over_are_refused(tmp_path, changed, sentence):
+    geometry = {"type": "fan", "views": 3, "source_distance": 5, "detector_distance": 7, "detector": 6}
+    text = json.dumps(geometry | {"detector_size": 4, "volume_size": 2})
+    arrays = {"line_integrals": np.ones((3, 6)), "variance": np.ones((3, 6))}
+    np.savez(tmp_path / "slice.npz", geometry=text, **(arrays | changed))
+    with pytest.raises(CaptureError, match=sentence):
+        ProjectionCapture.load(tmp_path / "slice.npz")
+    np.savez(tmp_path / "slice.npz", geometry=text, valid=np.eye(3, 6), **arrays)
+    assert ProjectionCapture.load(tmp_path / "slice.npz").valid.sum() == 3

@@ -225,6 +225,8 @@ class ProjectionCapture:
 def _captured(raw: RawScan, name: str, sigma: float, test: torch.Tensor | None) -> ProjectionCapture:
     """The capture of what was read; says what there is to know."""
     notes, values, variance, valid = raw.notes, raw.line_integrals, raw.variance, raw.valid
+    if valid is not None and valid.dtype.kind not in "biu" and not np.isin(valid, (0, 1)).all():
+        raise CaptureError(f"The mask 'valid' of '{name}' holds more than 0 and 1; store truth values.")
     if values is None:
         counts = _array(raw.intensities, "intensities")
         if counts.shape != raw.geometry.shape:

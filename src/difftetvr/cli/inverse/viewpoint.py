@@ -70,6 +70,8 @@ class Viewpoint:
     """Where to render, such as cpu or cuda; default: the best that works."""
     resume: bool = False
     """Go on with a search that was interrupted, with the same options."""
+    overwrite: bool = False
+    """Replace a search in OUT that was interrupted."""
     scalars: OmitArgPrefixes[ScalarOptions] = field(default_factory=ScalarOptions)
     mesh: OmitArgPrefixes[MeshOptions] = field(default_factory=MeshOptions)
     trust: OmitArgPrefixes[TrustOptions] = field(default_factory=TrustOptions)
@@ -77,7 +79,7 @@ class Viewpoint:
         "Search": ("measure", "poses", "starts", "scouts", "iterations", "search-size"),
         "Orbit and pictures": ("center", "radius", "up", "fov", "width", "height", "background"),
         "Scalars of a simulation": SCALAR_GROUP,
-        "How it is drawn": ("renderer", "split", "step", "device", "resume"),
+        "How it is drawn": ("renderer", "split", "step", "device", "resume", "overwrite"),
         **TRUST_GROUPS,
     }
 
@@ -89,7 +91,8 @@ class Viewpoint:
 
         background = color_of(self.background)
         self._require_sizes()
-        make_folder(self.output, _FILES)
+        unfinished = self._require_free()
+        make_folder(self.output, (*_FILES, _UNFINISHED))
         data = self.mesh.load(self.model, console)
         shown, device = self.scalars.apply(data, self.model), resolve_device(self.device)
         if shown.note is not None:
@@ -97,9 +100,6 @@ class Viewpoint:
         overlaps = not shown.mesh.is_conforming or data.defects.doubled_places > 0
         config = self._config("linked-list" if overlaps else "marching")
         mesh, content = shown.mesh.to(device=device), shown.field.to(device=device)
-        unfinished = self.output / _UNFINISHED
-        if self.resume and not unfinished.exists():
-            raise FitError(f"There is no unfinished search in {self.output}; leave out --resume.")
         try:
             with counting(console, f"Climbing to views of {self.model.name}", "climb") as progress:
                 search = best_viewpoint(
@@ -114,6 +114,23 @@ class Viewpoint:
         console.print(_table(search))
         console.print(f"{counted(search.renderings, 'picture')} rendered", highlight=False)
         console.print(f"Wrote {self.output / 'best.png'}; its camera: render --camera {self.output / 'best.json'}")
+
+    def _require_free(self) -> Path:
+        """The file of the search, after a look at whether there is one already.
+
+        Raises:
+            FitError: There is none to go on with, or one that would be lost.
+        """
+        unfinished = self.output / _UNFINISHED
+        if self.resume and self.overwrite:
+            raise FitError("A search can go on or be replaced; give one of --resume and --overwrite.")
+        if self.resume and not unfinished.exists():
+            raise FitError(f"There is no unfinished search in {self.output}; leave out --resume.")
+        if unfinished.exists() and not (self.resume or self.overwrite):
+            raise FitError(
+                f"There is an unfinished search in {self.output}; give --resume, --overwrite or another folder."
+            )
+        return unfinished
 
     def _require_sizes(self) -> None:
         if not 0.0 < self.fov < 180.0:

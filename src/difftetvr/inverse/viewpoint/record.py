@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from difftetvr.errors import DiffTetError, FitError
+from difftetvr.errors import FitError
 from difftetvr.fitting.records.checkpoint import require_no_folder
 from difftetvr.fitting.records.folder import write_json
 from difftetvr.mesh.field import Field
@@ -63,14 +63,13 @@ class SearchRecord:
             FitError: The file cannot be written.
         """
         state = {
-            "version": _VERSION,
             "problem": self.problem,
             "renderings": self.renderings,
             "most_seen": self.most_seen,
             "scouts": [view.summary() for view in self.scouts],
             "climbs": [[view.summary() for view in climb] for climb in self.climbs],
         }
-        write_json(path, state)
+        write_json(path, {"version": _VERSION, "sha256": _digest([state], []), **state})
 
     @staticmethod
     def load(path: Path, like: Camera) -> SearchRecord:
@@ -88,18 +87,17 @@ class SearchRecord:
             state = json.loads(path.read_text())
             if state.pop("version") != _VERSION:
                 raise FitError(f"The search in {path} is of another version of this program; start anew.")
+            # So that whatever is changed is noticed, a number that would be another view's among it.
+            if state.pop("sha256") != _digest([state], []):
+                raise ValueError
             scouts = [_view(view, like) for view in state.pop("scouts")]
             climbs = [[_view(view, like) for view in climb] for climb in state.pop("climbs")]
-            if not all(climbs):
-                raise ValueError
-            found = SearchRecord(scouts=scouts, climbs=climbs, **state)
-            found.renderings, found.most_seen = int(found.renderings), float(found.most_seen)
+            return SearchRecord(scouts=scouts, climbs=climbs, **state)
         except FitError:
             raise
-        except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError, DiffTetError) as error:
-            reason = error.strerror if isinstance(error, OSError) else "it is no record of a search"
+        except (OSError, ValueError, TypeError, KeyError, ArithmeticError, AttributeError, RecursionError) as error:
+            reason = error.strerror if isinstance(error, OSError) else "it is no record of a search, or damaged"
             raise FitError(f"The search in {path} cannot be read ({reason}); start anew.") from error
-        return found
 
     def require(self, problem: str, path: Path) -> None:
         """Checks that a search goes on with what it began with.
@@ -117,12 +115,20 @@ class SearchRecord:
 def problem_of(mesh: TetMesh, field: Field | ScalarField, options: dict[str, Any], colors: torch.Tensor | None) -> str:
     """What tells a search from others: a SHA-256 of all that decides what is found."""
     parts: list[torch.Tensor] = [mesh.vertices, mesh.tets, *field.arrays().values()]
-    numbers: list[Any] = [options, field.location, list(mesh.origin)]
+    numbers: list[Any] = [_as_floats(options), field.location, list(mesh.origin)]
     if isinstance(field, ScalarField):
         function = field.transfer_function
         parts += [function.scalar, function.opacity, function.color]
         numbers += [field.attenuation, field.value_range]
     return _digest(numbers, [*parts, *([] if colors is None else [colors])])
+
+
+def _as_floats(options: dict[str, Any]) -> dict[str, Any]:
+    """Options of which equal ones look alike."""
+    return {
+        name: list(map(float, value)) if isinstance(value, tuple) else float(value) if type(value) is int else value
+        for name, value in options.items()
+    }
 
 
 def _digest(numbers: list[Any], tensors: Iterable[torch.Tensor]) -> str:

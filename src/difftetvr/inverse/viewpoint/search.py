@@ -130,7 +130,7 @@ class ViewpointSearch:
 
     @property
     def worst(self) -> Viewpoint:
-        """The view with the least entropy of all that were rendered."""
+        """The view with the least entropy of all scouts and of where climbs began."""
         return min((*self.scouts, *(path[0] for path in self.paths)), key=lambda view: view.entropy)
 
 
@@ -155,7 +155,8 @@ def best_viewpoint(
         field: What it holds, see :func:`difftetvr.render`.
         config: What is measured, and from where; default: the opacity's entropy from an orbit.
         colors: (K, 3) colours whose areas are compared; default: :func:`difftetvr.inverse.reference_colors`.
-        checkpoint: File (JSON) to which the scouts and every climb that has ended are saved.
+        checkpoint: File (JSON) to which the scouts and every climb that has ended are saved; that of an earlier search
+            is replaced, no other file is.
         resume: Go on from ``checkpoint`` if it exists.
         on_progress: Called with the number of climbs that have ended, and of all; first once the scouts are rendered.
 
@@ -168,11 +169,17 @@ def best_viewpoint(
         FitError: The checkpoint cannot be used.
     """
     require_type(checkpoint, (str, os.PathLike, NoneType), "checkpoint", "pass the name of a file", FitError)
-    look, path = _Look.of(mesh, field, config, colors), None if checkpoint is None else Path(checkpoint)
-    climbs: list[list[Viewpoint]] = []
-    with alone_with(path) if path is not None else contextlib.nullcontext():
-        if path is not None and resume and path.exists():
-            climbs = look.resumed(path)
+    path = None if checkpoint is None else Path(checkpoint)
+    with contextlib.ExitStack() as stack:
+        # Climbs follow gradients, whatever a caller has switched off around them.
+        stack.enter_context(torch.inference_mode(False))
+        stack.enter_context(torch.enable_grad())
+        look = _Look.of(mesh, field, config, colors)
+        climbs: list[list[Viewpoint]] = []
+        if path is not None:
+            stack.enter_context(alone_with(path))
+            if path.exists():
+                climbs = look.taken_over(path) if resume else look.replaced(path)
         starts = look.starts()
         for count in range(len(climbs), len(starts) + 1):
             if count > len(climbs):
@@ -302,14 +309,30 @@ class _Look:
         """What has been found so far."""
         return SearchRecord(self.problem, self.renderings, self.most_seen, self.scouts, climbs)
 
-    def resumed(self, path: Path) -> list[list[Viewpoint]]:
-        """The climbs of an earlier search, whose scouts are taken over."""
-        saved = SearchRecord.load(path, self.poses.camera(self.poses.spread(1)[0]))
+    def taken_over(self, path: Path) -> list[list[Viewpoint]]:
+        """The climbs of an earlier search, whose scouts are taken over.
+
+        Raises:
+            FitError: It is none, or one of something else.
+        """
+        saved = self._saved(path)
         saved.require(self.problem, path)
         if len(saved.scouts) != self.config.scouts or len(saved.climbs) > self.config.starts:
             raise FitError(f"The search in {path} does not fit its own options; start anew.")
         self.renderings, self.most_seen, self.scouts = saved.renderings, saved.most_seen, saved.scouts
         return saved.climbs
+
+    def replaced(self, path: Path) -> list[list[Viewpoint]]:
+        """No climbs, after a look at what a search that begins anew will write over.
+
+        Raises:
+            FitError: It is no search.
+        """
+        self._saved(path)
+        return []
+
+    def _saved(self, path: Path) -> SearchRecord:
+        return SearchRecord.load(path, self.poses.camera(self.poses.spread(1)[0]))
 
     def climb(self, pose: torch.Tensor) -> list[Viewpoint]:
         """The views from a start uphill."""

@@ -26,10 +26,22 @@ def read_npz(path: Path, options: ScanOptions) -> RawScan:
         CaptureError: It is damaged, or an array is missing.
     """
     options.refuse_others(path, "gaussian")
-    arrays = read_arrays(path, CaptureError, lambda name, shape: name in (*_ARRAYS, GEOMETRY))
+    others: list[str] = []
+
+    def is_known(name: str, _: tuple[int, ...]) -> bool:
+        if name not in (*_ARRAYS, GEOMETRY):
+            others.append(name)
+        return name not in others
+
+    arrays = read_arrays(path, CaptureError, is_known)
     text = arrays.pop(GEOMETRY, None)
     if text is None or (text.size != 1 and text.dtype.kind != "u"):
         raise CaptureError(f"'{path}' has no 'geometry', the text of a geometry file; add it.")
+    if others:
+        raise CaptureError(
+            f"'{path}' holds '{others[0]}', which is no array of a scan; rename or remove it (known: "
+            f"{', '.join(_ARRAYS)}, {GEOMETRY})."
+        )
     return _scan(path, _decoded(text), arrays)
 
 
