@@ -216,9 +216,9 @@ class Hierarchy:
         farthest = dr.fmax(dr.fmax(dr.abs(point[0]), dr.abs(point[1])), dr.abs(point[2]))
         return rounding_of(farthest + self.size)
 
-    def item(self, place: Any, active: Any) -> tuple[Any, Any]:
+    def item(self, place: Any) -> tuple[Any, Any]:
         """Items by their places along the curve, and whether there are any."""
-        is_there = active & (place < self.leaves.count)
+        is_there = place < self.leaves.count
         return dr.gather(self.backend.UInt, self.leaves.items, place, is_there), is_there
 
     def _at_items(self, leaf: Any, visit: Callable[[Any, Any, Any], Any], state: Any) -> Any:
@@ -226,7 +226,7 @@ class Hierarchy:
         count = self.leaves.leaf_items
 
         def at_item(place: Any, state: Any) -> tuple[Any, Any]:
-            item, is_there = self.item(place, True)
+            item, is_there = self.item(place)
             return place + 1, visit(item, is_there, state)
 
         first = leaf * count

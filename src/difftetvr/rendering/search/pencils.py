@@ -82,7 +82,7 @@ class Pencils:
 
         def body(place: Any, count: Any) -> tuple[Any, Any]:
             number = dr.gather(uint, blocks, ROOM_FOR_BLOCKS * pencil + place // block)
-            item, is_there = hierarchy.item(block * number + place % block, True)
+            item, is_there = hierarchy.item(block * number + place % block)
             is_met = is_there & entry.may_be(item)
             dr.scatter(items, item, ROOM * pencil + count, is_met & (count < ROOM))
             return place + 1, count + dr.select(is_met, uint(1), uint(0))
