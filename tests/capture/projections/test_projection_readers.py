@@ -297,5 +297,11 @@ def test_masks_that_would_be_passed_over_are_refused(tmp_path, changed, sentence
     np.savez(tmp_path / "slice.npz", geometry=text, **(arrays | changed))
     with pytest.raises(CaptureError, match=sentence):
         ProjectionCapture.load(tmp_path / "slice.npz")
+    with h5py.File(tmp_path / "slice.h5", "w") as file:
+        file["geometry"] = text
+        for name, array in (arrays | changed).items():
+            file[name] = array
+    with pytest.raises(CaptureError, match=sentence):
+        ProjectionCapture.load(tmp_path / "slice.h5")
     np.savez(tmp_path / "slice.npz", geometry=text, valid=np.eye(3, 6), **arrays)
     assert ProjectionCapture.load(tmp_path / "slice.npz").valid.sum() == 3

@@ -61,6 +61,16 @@ class PlainFile:
         """
         return self._array(inside, part, _MOST_LINKS)
 
+    @property
+    def names(self) -> list[str]:
+        """What lies at the root of the file.
+
+        Raises:
+            MeshError: The file is damaged.
+        """
+        with _sentences(self.path):
+            return sorted(map(str, self._file))
+
     def holds(self, inside: str) -> bool:
         """Whether there is something at a path in the file; it need not be an array of numbers."""
         try:

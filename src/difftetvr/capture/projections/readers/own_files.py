@@ -17,6 +17,7 @@ from difftetvr.mesh.io.hdf5 import PlainFile
 
 _ARRAYS = ("line_integrals", "intensities", "flat", "dark", "variance", "valid", "test")
 _VALUES = ("line_integrals", "intensities")
+_KNOWN = (*_ARRAYS, GEOMETRY)
 
 
 def read_npz(path: Path, options: ScanOptions) -> RawScan:
@@ -26,22 +27,17 @@ def read_npz(path: Path, options: ScanOptions) -> RawScan:
         CaptureError: It is damaged, or an array is missing.
     """
     options.refuse_others(path, "gaussian")
-    others: list[str] = []
+    names: list[str] = []
 
     def is_known(name: str, _: tuple[int, ...]) -> bool:
-        if name not in (*_ARRAYS, GEOMETRY):
-            others.append(name)
-        return name not in others
+        names.append(name)
+        return name in _KNOWN
 
     arrays = read_arrays(path, CaptureError, is_known)
     text = arrays.pop(GEOMETRY, None)
     if text is None or (text.size != 1 and text.dtype.kind != "u"):
         raise CaptureError(f"'{path}' has no 'geometry', the text of a geometry file; add it.")
-    if others:
-        raise CaptureError(
-            f"'{path}' holds '{others[0]}', which is no array of a scan; rename or remove it (known: "
-            f"{', '.join(_ARRAYS)}, {GEOMETRY})."
-        )
+    _require_known(path, names)
     return _scan(path, _decoded(text), arrays)
 
 
@@ -52,10 +48,25 @@ def read_own_hdf5(path: Path, file: PlainFile, options: ScanOptions) -> RawScan:
         CaptureError: It is damaged, or an array is missing.
     """
     options.refuse_others(path, "gaussian")
+    _require_known(path, file.names)
     found = [name for name in _ARRAYS if file.holds(name)]
     for name in set(found) & set(_VALUES):
         require_room(path, file.shape_of(name))
     return _scan(path, file.text(GEOMETRY), {name: file.array(name) for name in found})
+
+
+def _require_known(path: Path, names: list[str]) -> None:
+    """Refuse arrays that would be passed over, such as a mask by another name.
+
+    Raises:
+        CaptureError: Names the first of them.
+    """
+    for name in names:
+        if name not in _KNOWN:
+            known = ", ".join(_KNOWN)
+            raise CaptureError(
+                f"'{path}' holds '{name}', which is no array of a scan; rename or remove it (known: {known})."
+            )
 
 
 def read_hdf5(path: Path, options: ScanOptions) -> RawScan:
