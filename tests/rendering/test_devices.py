@@ -161,15 +161,16 @@ def test_the_driver_of_machines_without_development_packages_is_found(tmp_path: 
     assert done.stdout.split() == ["True"]
 
 
-@pytest.mark.gpu
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
 @pytest.mark.parametrize("part", ["color", "harmonics", "density"])
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), float("-inf")])
-def test_what_is_not_finite_is_named_without_a_look_at_it_first(part: str, value: float) -> None:
+def test_what_is_not_finite_is_named_without_a_look_at_it_first(part: str, value: float, device: str) -> None:
     """Colours that depend on the direction are cut off at 0, which must hide nothing."""
-    mesh = TetMesh.grid((2, 2, 2)).to("cuda")
+    mesh = TetMesh.grid((2, 2, 2)).to(device)
     parts = {"color": (3,), "density": (), "harmonics": (3, 3)}
     values = {name: torch.full((mesh.num_vertices, *shape), 0.5) for name, shape in parts.items()}
     values[part].view(mesh.num_vertices, -1)[3, 0] = value
-    field = Field(**{name: tensor.to("cuda") for name, tensor in values.items()})
-    with pytest.raises(MeshError, match=f"{part} of vertex 3"):
-        render(mesh, field, CAMERAS["outside"])
+    field = Field(**{name: tensor.to(device) for name, tensor in values.items()})
+    for view in (CAMERAS["outside"], CAMERAS["outside"].rays()):
+        with pytest.raises(MeshError, match=f"{part} of vertex 3"):
+            render(mesh, field, view)

@@ -146,8 +146,9 @@ class _Source:
 def _see(source: _Source, length: int) -> Any:
     """Flat (length, 3) colours, for :func:`difftetvr.recording.replayed`."""
     basis = _functions(source.direction()[0], source.degree)
-    # Comparisons with NaN are false: it stays what it is, for somebody to find.
-    colors = [dr.select(part < 0, 0, part) for part in source.colors(basis, source.coefficients())]
+    # What is not finite stays what it is, for somebody to find.
+    unlimited = source.colors(basis, source.coefficients())
+    colors = [dr.select((part < 0) & dr.isfinite(part), 0, part) for part in unlimited]
     seen = _written(source, colors, length)
     dr.eval(seen)
     return seen

@@ -277,14 +277,7 @@ def _seen(
     if not isinstance(field, Field) or field.harmonics is None:
         return field, None
     viewpoint = Viewpoint.of(mesh, camera, is_parallel)
-    if mesh.vertices.is_cpu:
-        field.validate(mesh)
-        return viewpoint.seen(field, mesh), viewpoint
-    # Colours are cut off at 0, and with them what is not finite: densities take it to kernels, which look for it, so
-    # that the host need not wait.
-    is_finite = torch.stack([torch.isfinite(part.detach()).all() for part in (field.color, field.harmonics)]).all()
-    seen = viewpoint.seen(field, mesh)
-    return replace(seen, density=torch.where(is_finite, seen.density, torch.nan)), viewpoint
+    return viewpoint.seen(field, mesh), viewpoint
 
 
 def _content(mesh: TetMesh, field: Field | ScalarField | CellFeatures) -> tuple[Content, tuple[torch.Tensor, ...]]:
