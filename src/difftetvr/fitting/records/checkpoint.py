@@ -79,7 +79,7 @@ class Checkpoint:
         for name, values in zip(_HISTORY, (self.history.loss, self.history.psnr), strict=True):
             tensors[name] = torch.tensor(values, dtype=torch.float64)
         text = json.dumps(state)
-        metadata = {"state": text, "sha256": _checksum(text, tensors)}
+        metadata = {"state": text, "sha256": checksum(text, tensors)}
         try:
             content = safetensors.torch.save(tensors, metadata=metadata)
         except BaseException as panic:
@@ -114,7 +114,7 @@ class Checkpoint:
             raise FitError(
                 f"The checkpoint {path} has version {version}, this program reads version {_VERSION}; start anew."
             )
-        if metadata.get("sha256") != _checksum(metadata["state"], tensors):
+        if metadata.get("sha256") != checksum(metadata["state"], tensors):
             raise _unreadable(path, "its content does not match its checksum")
         try:
             return _checkpoint(state, tensors, str(path), options)
@@ -126,7 +126,7 @@ class Checkpoint:
         tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in self.tensors.items()}
         # Machines may read the same images to other last digits.
         images = {name: value for name, value in self.capture.items() if not isinstance(value, float)}
-        return _checksum(json.dumps([self.iteration, self.config.to_json(), images, self.budget]), tensors)
+        return checksum(json.dumps([self.iteration, self.config.to_json(), images, self.budget]), tensors)
 
     def mesh(self) -> TetMesh:
         """The mesh of the run.
@@ -233,8 +233,8 @@ def _checkpoint(
     return Checkpoint(iteration, config, capture, tensors, budget, strategy, history, repair, source)
 
 
-def _checksum(state: str, tensors: dict[str, torch.Tensor]) -> str:
-    """SHA-256 of the header's state and of every tensor's name, type, shape and bytes."""
+def checksum(state: str, tensors: dict[str, torch.Tensor]) -> str:
+    """SHA-256 of a text and of every tensor's name, type, shape and bytes; they are contiguous and on the CPU."""
     digest = hashlib.sha256(state.encode())
     for name in sorted(tensors):
         tensor = tensors[name]

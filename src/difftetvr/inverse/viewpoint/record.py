@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +10,7 @@ from typing import Any
 import torch
 
 from difftetvr.errors import FitError
-from difftetvr.fitting.records.checkpoint import require_no_folder
+from difftetvr.fitting.records.checkpoint import checksum, require_no_folder
 from difftetvr.fitting.records.folder import write_json
 from difftetvr.mesh.field import Field
 from difftetvr.mesh.tetmesh import TetMesh
@@ -69,7 +67,7 @@ class SearchRecord:
             "scouts": [view.summary() for view in self.scouts],
             "climbs": [[view.summary() for view in climb] for climb in self.climbs],
         }
-        write_json(path, {"version": _VERSION, "sha256": _digest([state], []), **state})
+        write_json(path, {"version": _VERSION, "sha256": checksum(json.dumps(state), {}), **state})
 
     @staticmethod
     def load(path: Path, like: Camera) -> SearchRecord:
@@ -88,7 +86,7 @@ class SearchRecord:
             if state.pop("version") != _VERSION:
                 raise FitError(f"The search in {path} is of another version of this program; start anew.")
             # So that whatever is changed is noticed, a number that would be another view's among it.
-            if state.pop("sha256") != _digest([state], []):
+            if state.pop("sha256") != checksum(json.dumps(state), {}):
                 raise ValueError
             scouts = [_view(view, like) for view in state.pop("scouts")]
             climbs = [[_view(view, like) for view in climb] for climb in state.pop("climbs")]
@@ -114,13 +112,16 @@ class SearchRecord:
 
 def problem_of(mesh: TetMesh, field: Field | ScalarField, options: dict[str, Any], colors: torch.Tensor | None) -> str:
     """What tells a search from others: a SHA-256 of all that decides what is found."""
-    parts: list[torch.Tensor] = [mesh.vertices, mesh.tets, *field.arrays().values()]
+    tensors = {"vertices": mesh.vertices, "tets": mesh.tets, **field.arrays()}
     numbers: list[Any] = [_as_floats(options), field.location, list(mesh.origin)]
     if isinstance(field, ScalarField):
         function = field.transfer_function
-        parts += [function.scalar, function.opacity, function.color]
+        tensors |= {"knots": function.scalar, "opacity": function.opacity, "colors": function.color}
         numbers += [field.attenuation, field.value_range]
-    return _digest(numbers, [*parts, *([] if colors is None else [colors])])
+    if colors is not None:
+        tensors["references"] = colors
+    parts = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    return checksum(json.dumps(numbers), parts)
 
 
 def _as_floats(options: dict[str, Any]) -> dict[str, Any]:
@@ -129,15 +130,6 @@ def _as_floats(options: dict[str, Any]) -> dict[str, Any]:
         name: list(map(float, value)) if isinstance(value, tuple) else float(value) if type(value) is int else value
         for name, value in options.items()
     }
-
-
-def _digest(numbers: list[Any], tensors: Iterable[torch.Tensor]) -> str:
-    digest = hashlib.sha256(json.dumps(numbers).encode())
-    for tensor in tensors:
-        values = tensor.detach().cpu().contiguous()
-        digest.update(f"{values.dtype} {tuple(values.shape)}".encode())
-        digest.update(values.reshape(-1).numpy().data)
-    return digest.hexdigest()
 
 
 def _view(summary: dict[str, Any], like: Camera) -> Viewpoint:
