@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 
@@ -93,26 +94,22 @@ class ScalarField:
     def normalised(self) -> torch.Tensor:
         """The scalars in units of the range, so that the transfer function's [0, 1] spans it; differentiable."""
         limits = torch.finfo(self.scalar.dtype)
-        low, unit, extent = self._span_given(limits) if self.value_range else self._span_found(limits)
+        low, unit, extent = self._span(limits)
         # Infinite ones could not be interpolated; they lie so far outside that it makes no difference.
         return ((unit * self.scalar - unit * low) / extent).nan_to_num(posinf=limits.max / 4, neginf=-limits.max / 4)
 
-    def _span_given(self, limits: torch.finfo) -> tuple[float, float, float]:
+    def _span(self, limits: torch.finfo) -> tuple[Any, Any, Any]:
         """The lower end of the range, a unit, and in that the range's extent, 1 where it has none.
 
-        The difference of two numbers may overflow, that of their halves, quarters, ... does not.
+        Of the scalars' own range these are tensors, which no host waits for, of a given one numbers, which all devices
+        take. The difference of two numbers may overflow, that of their halves, quarters, ... does not.
         """
-        low, high = self.limits
-        exponent = math.frexp(max(abs(low), abs(high)))[1]
-        unit = math.ldexp(1.0, min(math.frexp(limits.max)[1] - 1 - exponent, 0))
-        return low, unit, max(unit * high - unit * low, limits.tiny) if high > low else 1.0
-
-    def _span_found(self, limits: torch.finfo) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """The same of the scalars themselves, as tensors, for which no host waits."""
-        low, high = torch.aminmax(self.scalar.detach())
+        given = self.value_range
+        low, high = torch.aminmax(self.scalar.detach()) if given is None else torch.tensor(given, dtype=torch.float64)
         exponent = torch.frexp(torch.maximum(low.abs(), high.abs())).exponent
         unit = torch.ldexp(torch.ones_like(low), (math.frexp(limits.max)[1] - 1 - exponent).clamp(max=0))
-        return low, unit, torch.where(high > low, (unit * high - unit * low).clamp(min=limits.tiny), 1.0)
+        extent = torch.where(high > low, (unit * high - unit * low).clamp(min=limits.tiny), 1.0)
+        return (low, unit, extent) if given is None else (float(low), float(unit), float(extent))
 
     def as_field(self) -> Field:
         """Colour and density at the vertices or cells themselves.
