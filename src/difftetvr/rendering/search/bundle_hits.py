@@ -173,9 +173,8 @@ class _BundleSearch:
 
             return dr.if_stmt((state,), holds_ray(face) & active, held, lambda state: state)
 
-        lane, is_many = self.pencils.for_each(lane, rays.valid, at_face, lane)
         beam = Beam.of(rays, near, far)
-        beam.valid = is_many
+        beam.valid = self.pencils.for_each(lane, rays.valid, at_face, lane)
         self.boundary.meet_lines(beam, at_face, lane)
 
     def _for_each_start(self, visit: Visit) -> None:

@@ -96,7 +96,7 @@ class Pencils:
         """Visit the items that the pencils of some lanes met, as :meth:`Hierarchy.meet_lines` does.
 
         Returns:
-            The new state, and the lanes whose pencils met too many, which visited none.
+            Which lanes have pencils that met too many, and visited none.
         """
         uint = type(lane)
         pencil = lane // RAYS
@@ -108,8 +108,8 @@ class Pencils:
             item = dr.gather(uint, self.items, ROOM * pencil + place)
             return place + 1, visit(item, dr.mask_t(lane)(True), state)
 
-        state = dr.while_loop((dr.zeros(uint, dr.width(lane)), state), lambda place, _: place < count, body)[1]
-        return state, is_many
+        dr.while_loop((dr.zeros(uint, dr.width(lane)), state), lambda place, _: place < count, body)
+        return is_many
 
 
 @dataclass
