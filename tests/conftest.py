@@ -1,5 +1,6 @@
 """What all tests share: the `gpu` marker, threads, and the folder of example data."""
 
+import gc
 import os
 import subprocess
 import sys
@@ -23,6 +24,14 @@ def _cuda_works() -> bool:
     import torch
 
     return torch.cuda.is_available() and drjit.has_backend(drjit.JitBackend.CUDA)
+
+
+@pytest.fixture
+def recwarn(recwarn: pytest.WarningsRecorder) -> pytest.WarningsRecorder:
+    """Warnings of this test alone: files that others left open warn when they are collected, at whatever moment."""
+    gc.collect()
+    recwarn.clear()
+    return recwarn
 
 
 @pytest.fixture(autouse=True, scope="module")
