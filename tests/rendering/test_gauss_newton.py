@@ -13,7 +13,7 @@ from difftetvr.mesh import Field, TetMesh, bisect_edges
 from difftetvr.mesh.changes.flip_search import find_flips
 from difftetvr.mesh.changes.flips import TWO_TO_THREE, apply_flips
 from difftetvr.rendering import Camera, LensCamera, render
-from difftetvr.rendering.gauss_newton import HatDerivatives, model_image, model_line_integrals
+from difftetvr.rendering.gauss_newton import HatChoice, HatDerivatives, model_image, model_line_integrals
 
 BACKGROUND = (0.3, 0.6, 0.1)
 OUTSIDE = {"eye": (0.4, -1.5, 0.9), "target": (0.5, 0.5, 0.5)}
@@ -246,11 +246,42 @@ def test_float32_and_one_thread_agree():
         assert (single.absorption - double.absorption).norm() <= 1e-3 * double.absorption.norm()
 
 
+@pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
+def test_edges_that_are_asked_for_have_the_models_of_all(share):
+    mesh, field, truth = random_scene(torch.float32)
+    generator = torch.Generator().manual_seed(0)
+    edges = torch.rand(mesh.topology.edges.shape[0], generator=generator) < share
+    steps = torch.rand(mesh.topology.faces.shape[0], 4, generator=generator)
+    steps[torch.rand(len(steps), generator=generator) < 0.8] = 0.0
+    camera, of_image = camera_at(OUTSIDE), {"background": BACKGROUND, "deterministic": True}
+    whole, few = (
+        model_image(mesh, field, camera, truth, hats=HatChoice(asked, steps), **of_image) for asked in (None, edges)
+    )
+    errors = truth[..., 0], truth[..., 1]
+    others = [
+        model_line_integrals(mesh, field.density, camera, errors, HatChoice(asked, steps), deterministic=True)
+        for asked in (None, edges)
+    ]
+    for every, some in ((whole, few), others):
+        for name in ("gradient", "emission", "coupling", "absorption", "weight"):
+            expected, found = getattr(every.edges, name), getattr(some.edges, name)
+            assert torch.equal(found[edges], expected[edges]) and not found[~edges].any()
+            assert torch.equal(getattr(some.vertices, name), getattr(every.vertices, name))
+        assert torch.equal(some.face_steps.slope, every.face_steps.slope) and bool(some.face_steps.slope.any())
+        unasked = ~(steps != 0).any(1)
+        assert not some.face_steps.slope[unasked].any() and not some.face_steps.curvature[unasked].any()
+
+
 def test_what_is_refused():
     mesh, field, truth = random_scene()
     per_cell = dtv.Field(torch.rand(mesh.num_cells, 3), torch.rand(mesh.num_cells))
     with pytest.raises(DiffTetError, match=r"face_steps has shape \(3, 4\); this mesh takes \(\d+, 4\)\."):
-        model_image(mesh, field, camera_at(OUTSIDE), truth, face_steps=torch.zeros(3, 4))
+        model_image(mesh, field, camera_at(OUTSIDE), truth, hats=HatChoice(face_steps=torch.zeros(3, 4)))
+    with pytest.raises(DiffTetError, match=r"edges is .*; pass a bool tensor of shape \(\d+,\), one for each edge\."):
+        model_image(mesh, field, camera_at(OUTSIDE), truth, hats=HatChoice(edges=torch.arange(3)))
+    errors = torch.zeros(48, 48), torch.zeros(48, 48)
+    with pytest.raises(DiffTetError, match="No steps of faces"):
+        model_line_integrals(mesh, field.density, camera_at(OUTSIDE), errors, HatChoice())
     with pytest.raises(MeshError, match="lives on cells"):
         model_image(mesh, per_cell, camera_at(OUTSIDE), truth)
     with pytest.raises(DiffTetError, match=r"shape \(48, 48, 3\); the camera takes \(30, 30, 3\)"):
@@ -259,12 +290,12 @@ def test_what_is_refused():
 
 def test_views_of_no_rays_are_refused():
     mesh = TetMesh.grid((1, 1, 1))
-    density, steps = torch.ones(mesh.num_vertices), torch.zeros(mesh.topology.faces.shape[0])
+    density, hats = torch.ones(mesh.num_vertices), HatChoice(face_steps=torch.zeros(mesh.topology.faces.shape[0], 4))
     rays = dtv.Rays(torch.zeros(0, 3, 3), torch.ones(0, 3, 3))
     with pytest.raises(DiffTetError, match="says nothing"):
         model_image(mesh, Field(torch.ones(mesh.num_vertices, 3), density), rays, torch.zeros(0, 3, 3))
     with pytest.raises(DiffTetError, match="says nothing"):
-        model_line_integrals(mesh, density, rays, (torch.zeros(0, 3), torch.zeros(0, 3)), steps)
+        model_line_integrals(mesh, density, rays, (torch.zeros(0, 3), torch.zeros(0, 3)), hats)
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e4])
@@ -285,9 +316,9 @@ def test_models_of_line_integrals_predict_what_densities_do(scale):
 
     flips = find_flips(mesh)
     values = torch.nn.functional.pad(density[:, None], (3, 0))
-    steps = face_steps(flips, values)[:, 3]
+    hats = HatChoice(face_steps=face_steps(flips, values))
     errors = weights * (integrals(mesh, density) - measured), weights
-    model = model_line_integrals(mesh, density, camera, errors, steps)
+    model = model_line_integrals(mesh, density, camera, errors, hats)
     step = torch.tensor([[0.0, 0.0, 0.0, 0.3 * unit]], dtype=torch.float64)
     before = loss(mesh, density)
     for vertex in range(0, mesh.num_vertices, 7):
@@ -306,4 +337,4 @@ def test_models_of_line_integrals_predict_what_densities_do(scale):
         after = loss(apply_flips(flips.select(one[None])).mesh, density)
         assert before - after == pytest.approx(float(gains[one]), rel=0.1, abs=2e-3 * before)
     with pytest.raises(DiffTetError, match="shape"):
-        model_line_integrals(mesh, density, camera, (errors[0][1:], weights), steps)
+        model_line_integrals(mesh, density, camera, (errors[0][1:], weights), hats)

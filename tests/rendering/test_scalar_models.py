@@ -9,7 +9,7 @@ from torch import Tensor
 import difftetvr as dtv
 from difftetvr.mesh import TetMesh, bisect_edges
 from difftetvr.rendering import Camera, ScalarField, render
-from difftetvr.rendering.gauss_newton import model_image
+from difftetvr.rendering.gauss_newton import HatChoice, model_image
 
 BACKGROUND = (0.3, 0.6, 0.1)
 CAMERAS = [
@@ -87,7 +87,7 @@ def test_steps_of_faces_are_those_of_all() -> None:
     step = torch.linspace(-0.2, 0.2, mesh.topology.faces.shape[0]).double()
     steps = torch.nn.functional.pad(step[:, None], (3, 0))
     whole = model_image(mesh, seen(scalar), CAMERAS[0], truth, BACKGROUND)
-    asked = model_image(mesh, seen(scalar), CAMERAS[0], truth, BACKGROUND, face_steps=steps)
+    asked = model_image(mesh, seen(scalar), CAMERAS[0], truth, BACKGROUND, hats=HatChoice(face_steps=steps))
     assert whole.faces is not None and asked.face_steps is not None
     torch.testing.assert_close(asked.face_steps.slope, step * whole.faces.gradient[:, 3], rtol=1e-4, atol=1e-12)
     expected = step.square() * whole.faces.absorption

@@ -75,7 +75,7 @@ CALLS: dict[str, tuple[Callable[..., Any], dict[str, Any], tuple[str, ...]]] = {
     "model_image": (
         model_image,
         {**RENDER, "truth": torch.zeros(8, 8, 3)},
-        ("mesh", "field", "camera", "truth", "background", "transmittance_threshold", "valid"),
+        ("mesh", "field", "camera", "truth", "background", "transmittance_threshold", "valid", "hats"),
     ),
     "Camera": (Camera, {**POSE, "width": 8, "height": 8}, (*POSE, "width", "height")),
     "look_at": (Camera.look_at, {"eye": (1, 2, 3), "target": (0, 0, 0)}, ("eye", "target", "up", "fov_y", "width")),

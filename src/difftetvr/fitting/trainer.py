@@ -28,7 +28,7 @@ from difftetvr.fitting.refinement.adaptive_run import AdaptiveRun
 from difftetvr.fitting.refinement.pixels import Judgement
 from difftetvr.mesh.field import Field
 from difftetvr.mesh.tetmesh import TetMesh
-from difftetvr.rendering.gauss_newton import ImageModel
+from difftetvr.rendering.gauss_newton import HatChoice, ImageModel
 
 _READ_EVERY = 25
 """Iterations from one question to a GPU how they went to the next: the host waits for each answer."""
@@ -266,10 +266,9 @@ class Trainer(AdaptiveRun):
         judgement, mesh = self._judgement(self._judged_views), self.mesh
         unit = self.capture.density_unit
 
-        def model(steps: torch.Tensor | None) -> ImageModel:
-            in_units = None if steps is None else torch.cat((steps[:, :3], unit * steps[:, 3:]), 1)
+        def model(hats: HatChoice) -> ImageModel:
             field, deterministic = self.field(), self.config.deterministic
-            return judgement.model(mesh, field, deterministic, in_units).with_density_unit(unit)
+            return judgement.model(mesh, field, deterministic, hats.from_density_unit(unit)).with_density_unit(unit)
 
         values = self.parameters.values(unit)
         situation = Situation(mesh, values, self._moment(), model, self._color_gradients, self._free_space)

@@ -13,7 +13,7 @@ from difftetvr.fitting.records.evaluation import true_image
 from difftetvr.fitting.refinement import pixels
 from difftetvr.fitting.refinement.pixels import JudgedPixels, Judgement
 from difftetvr.mesh import Field, TetMesh
-from difftetvr.rendering.gauss_newton import model_image
+from difftetvr.rendering.gauss_newton import HatChoice, model_image
 
 VIEWS = [0, 3, 5]
 BACKGROUND = (0.0, 0.0, 0.0)
@@ -86,9 +86,9 @@ def test_a_process_without_pixels_has_a_model_that_changes_no_sum(
     capture: Capture, scene: tuple[TetMesh, Field], has_steps: bool
 ) -> None:
     mesh, field = scene
-    steps = torch.ones(mesh.topology.faces.shape[0], 4) if has_steps else None
-    model = judgement(capture, mesh).together().model(mesh, field, True, steps)
-    nothing = Judgement([], len(VIEWS)).model(mesh, field, True, steps)
+    hats = HatChoice(face_steps=torch.ones(mesh.topology.faces.shape[0], 4)) if has_steps else None
+    model = judgement(capture, mesh).together().model(mesh, field, True, hats)
+    nothing = Judgement([], len(VIEWS)).model(mesh, field, True, hats)
     total, known = model + nothing, model.face_steps if has_steps else model.faces
     assert total.error == model.error and Judgement([], len(VIEWS)).error(mesh, field) == 0.0
     for one, other in ((total.vertices, model.vertices), (total.edges, model.edges)):

@@ -8,13 +8,20 @@ import torch
 from difftetvr.capture.free_space import FreeSpace
 from difftetvr.errors import FitError
 from difftetvr.fitting.refinement import Exchange, Grow, Moment, Situation, Star
-from difftetvr.fitting.refinement.gains import bisection_gains, collapse_costs, edges_before, face_steps, flip_gains
+from difftetvr.fitting.refinement.gains import (
+    Candidates,
+    bisection_gains,
+    collapse_costs,
+    edges_before,
+    face_steps,
+    flip_gains,
+)
 from difftetvr.mesh import Field, TetMesh, bisect_edges, collapse_edges
 from difftetvr.mesh.changes.flip_search import find_flips
 from difftetvr.mesh.changes.flips import apply_flips
 from difftetvr.mesh.locate import locate
 from difftetvr.rendering import Camera, render
-from difftetvr.rendering.gauss_newton import model_image
+from difftetvr.rendering.gauss_newton import HatChoice, model_image
 
 NOWHERE = FreeSpace([], [])
 CAMERA = Camera.look_at(eye=(0.4, -1.6, 0.9), target=(0.5, 0.5, 0.5), up=(0, 0, 1), width=48, height=48)
@@ -62,7 +69,7 @@ def situation_of(scene, budget=None, iteration=100, free_space=NOWHERE):
     mesh, values, _, model = scene
     moment = Moment(iteration, 1000, 10, mesh.num_cells, budget or mesh.num_cells)
     gradients = torch.linspace(0, 1, mesh.num_vertices)
-    return Situation(mesh, values, moment, lambda face_steps: model, lambda: gradients, free_space)
+    return Situation(mesh, values, moment, lambda hats: model, lambda: gradients, free_space)
 
 
 def everything(mesh):
@@ -151,7 +158,8 @@ def test_flips_gain_the_same_by_the_one_step_that_is_asked_for(scene):
     flips = find_flips(mesh)
     steps = face_steps(flips, values)
     assert 0 < int(steps.any(1).sum()) < len(steps)
-    asked = model_image(mesh, field_of(values), CAMERA, truth, transmittance_threshold=0.0, face_steps=steps)
+    hats = HatChoice(face_steps=steps)
+    asked = model_image(mesh, field_of(values), CAMERA, truth, transmittance_threshold=0.0, hats=hats)
     assert asked.faces is None
     expected = flip_gains(flips, values, model)
     torch.testing.assert_close(flip_gains(flips, values, asked), expected, rtol=1e-9, atol=1e-9 * float(expected.max()))
@@ -223,8 +231,10 @@ def test_flip_gains_are_those_of_real_flips(scene):
 @pytest.mark.parametrize(("stays_empty", "start"), [(False, 1.0), (True, 1.0), (True, 0.6)])
 def test_bisections_win_what_is_predicted(scene, stays_empty, start):
     mesh, values, truth, model = scene
-    is_free = torch.full((len(mesh.topology.edges),), stays_empty)
-    gains = bisection_gains(mesh, values, model.edges, is_free, start)
+    edges = torch.arange(0, len(mesh.topology.edges), 2)
+    candidates = Candidates(edges, torch.full((len(edges),), stays_empty))
+    gains = bisection_gains(mesh, values, model.edges, candidates, start)
+    assert not gains.gain[1::2].any() and not gains.start[1::2].any()
     before = error_of(mesh, values, truth)
     best = gains.start_gain.argsort(descending=True)[:12]
     achieved = 0.0

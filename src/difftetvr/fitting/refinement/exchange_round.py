@@ -7,12 +7,14 @@ from typing import TYPE_CHECKING
 import torch
 
 from difftetvr.fitting.refinement.gains import (
+    Candidates,
     CollapseCosts,
     bisection_gains,
     collapse_costs,
     edges_before,
     face_steps,
     flip_gains,
+    vanishing_edges,
 )
 from difftetvr.fitting.refinement.strategy import Refinement, Situation
 from difftetvr.mesh.arrays import true_indices
@@ -24,7 +26,7 @@ from difftetvr.mesh.changes.flip_search import find_flips
 from difftetvr.mesh.changes.flips import THREE_TO_TWO, TWO_TO_THREE, Flips, apply_flips, independent_flips
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.mesh.topology.incidence import cell_edges, cells_per_edge, find_edges
-from difftetvr.rendering.gauss_newton import ImageModel
+from difftetvr.rendering.gauss_newton import HatChoice, ImageModel
 
 if TYPE_CHECKING:
     from difftetvr.fitting.refinement.exchange import Exchange
@@ -43,10 +45,9 @@ def exchange_cells(situation: Situation, target: int, options: Exchange) -> Refi
     """
     mesh = situation.mesh
     flips = find_flips(mesh, min_quality=options.min_quality) if options.flips else None
-    # What is known of faces is what the flips that they allow would win; without flips, nothing.
-    none = situation.values.new_zeros((mesh.topology.faces.shape[0], 4))
-    model = situation.model(none if flips is None else face_steps(flips, situation.values))
-    exchange = _Round(situation, model, options)
+    may_bisect = long_edges(mesh, options.long)
+    model = situation.model(_hats_of(mesh, situation.values, may_bisect, flips))
+    exchange = _Round(situation, model, may_bisect, options)
     if flips is not None:
         exchange.flip(flips, model, target, options)
     if options.share:
@@ -55,15 +56,24 @@ def exchange_cells(situation: Situation, target: int, options: Exchange) -> Refi
     return exchange.refinement()
 
 
+def _hats_of(mesh: TetMesh, values: torch.Tensor, may_bisect: torch.Tensor, flips: Flips | None) -> HatChoice:
+    """What has to be known: of edges that may be bisected, and of what flips would take away."""
+    if flips is None:
+        return HatChoice(may_bisect, values.new_zeros((mesh.topology.faces.shape[0], 4)))
+    edges = may_bisect.index_fill(0, vanishing_edges(flips)[1], True)
+    return HatChoice(edges, face_steps(flips, values))
+
+
 class _Round:
     """The mesh so far, and what is known about its edges."""
 
-    def __init__(self, situation: Situation, model: ImageModel, options: Exchange) -> None:
+    def __init__(self, situation: Situation, model: ImageModel, may_bisect: torch.Tensor, options: Exchange) -> None:
         self.mesh = situation.mesh
         self.values = situation.values.to(model.edges.gradient.dtype)
-        middles = self.mesh.vertices[self.mesh.topology.edges.long()].mean(1)
-        is_free = situation.free_space.contains(middles)
-        self.gains = bisection_gains(self.mesh, self.values, model.edges, is_free, options.start, situation.reach)
+        edges = true_indices(may_bisect)
+        middles = self.mesh.vertices[self.mesh.topology.edges[edges].long()].mean(1)
+        candidates = Candidates(edges, situation.free_space.contains(middles))
+        self.gains = bisection_gains(self.mesh, self.values, model.edges, candidates, options.start, situation.reach)
         self.reach = situation.reach
         self.surplus: torch.Tensor | None = None
         self.changes: list[MeshChange] = []

@@ -47,32 +47,50 @@ class BisectionGains:
         )
 
 
+@dataclass(frozen=True)
+class Candidates:
+    """Edges that may be bisected.
+
+    Attributes:
+        edges: (N,) indices into ``topology.edges``.
+        is_free: (N,) bool, whose new vertices have to have density 0.
+    """
+
+    edges: torch.Tensor
+    is_free: torch.Tensor
+
+
 def bisection_gains(
     mesh: TetMesh,
     values: torch.Tensor,
     edges: HatDerivatives,
-    is_free: torch.Tensor,
+    candidates: Candidates,
     start: float = 1.0,
     reach: float = math.inf,
 ) -> BisectionGains:
-    """Predicts what bisecting each edge would win.
+    """Predicts what bisecting each edge would win; those that are no candidates win nothing.
 
     Args:
         mesh: The mesh.
         values: (V, 4) parameters.
         edges: Derivatives by the hats of ``mesh.topology.edges``.
-        is_free: (E,) bool, whose new vertices have to have density 0.
+        candidates: Which of them may be bisected.
         start: Part of the best surplus that new vertices start with.
         reach: Greatest surplus that is looked at.
     """
-    ends = mesh.topology.edges.long()
-    middle = values[ends].mean(1)
+    count, chosen, is_free = mesh.topology.edges.shape[0], candidates.edges, candidates.is_free
+    middle = values[mesh.topology.edges[chosen].long()].mean(1)
     most = torch.where(is_free, -middle[:, 3], torch.inf)
     upper = torch.cat((1.0 - middle[:, :3], most[:, None]), 1)
-    best = edges.best_step((-middle).clamp(min=-reach), upper.clamp(max=reach), _DAMPING)
+    hats = edges[chosen]
+    best = hats.best_step((-middle).clamp(min=-reach), upper.clamp(max=reach), _DAMPING)
     first = start * best
     first[:, 3] = torch.where(is_free, most, first[:, 3])
-    return BisectionGains(edges.decrease(best).clamp_min(0.0), edges.decrease(first), first)
+    found = BisectionGains(*(values.new_zeros(count, *shape) for shape in ((), (), (4,))))
+    found.gain[chosen] = hats.decrease(best).clamp_min(0.0)
+    found.start_gain[chosen] = hats.decrease(first)
+    found.start[chosen] = first
+    return found
 
 
 @dataclass(frozen=True)
@@ -148,7 +166,7 @@ def flip_gains(flips: Flips, values: torch.Tensor, model: ImageModel) -> torch.T
     Returns:
         (N,) predicted decrease of the error.
     """
-    topology, surplus = flips.mesh.topology, flips.surplus(values)
+    surplus = flips.surplus(values)
     gain = torch.zeros_like(surplus[:, 0])
     by_face = true_indices(flips.kind == TWO_TO_THREE)
     faces = _vanishing_faces(flips, by_face)
@@ -157,11 +175,17 @@ def flip_gains(flips: Flips, values: torch.Tensor, model: ImageModel) -> torch.T
         gain[by_face] = model.face_steps.decrease()[faces]
     else:
         gain[by_face] = model.faces[faces].decrease(surplus[by_face])
+    by_edge, edges = vanishing_edges(flips)
+    gain[by_edge] = model.edges[edges].decrease(surplus[by_edge])
+    return gain
+
+
+def vanishing_edges(flips: Flips) -> tuple[torch.Tensor, torch.Tensor]:
+    """Which flips take an edge away, (N,) int64, and which edge, (N,) indices into ``topology.edges``."""
     by_edge = true_indices(flips.kind != TWO_TO_THREE)
     is_ring = (flips.kind[by_edge] == FOUR_TO_FOUR)[:, None]
     ends = torch.where(is_ring, flips.ring[by_edge][:, [0, 2]], flips.edge[by_edge])
-    gain[by_edge] = model.edges[find_edges(topology, ends.long())].decrease(surplus[by_edge])
-    return gain
+    return by_edge, find_edges(flips.mesh.topology, ends.long())
 
 
 def face_steps(flips: Flips, values: torch.Tensor) -> torch.Tensor:

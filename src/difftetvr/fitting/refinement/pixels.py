@@ -15,7 +15,7 @@ from difftetvr.fitting.processes import ALONE, Processes
 from difftetvr.mesh.field import Field
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.rendering import Camera, Rays, ScalarField, render
-from difftetvr.rendering.gauss_newton import ImageModel, model_image
+from difftetvr.rendering.gauss_newton import HatChoice, ImageModel, model_image
 from difftetvr.rendering.rays import image_order
 
 _CROSSINGS = 400.0
@@ -83,7 +83,7 @@ class JudgedPixels:
         return replace(self, rays=rays, truth=self.truth[:, places], valid=valid)
 
     def model(
-        self, mesh: TetMesh, field: Field | ScalarField, deterministic: bool, face_steps: torch.Tensor | None = None
+        self, mesh: TetMesh, field: Field | ScalarField, deterministic: bool, hats: HatChoice | None = None
     ) -> ImageModel:
         """Quadratic models of the squared error; what says how great it is counts the valid pixels alone."""
         model = model_image(
@@ -94,7 +94,7 @@ class JudgedPixels:
             self.background,
             deterministic=deterministic,
             valid=self.valid,
-            face_steps=face_steps,
+            hats=hats,
         )
         return replace(model, error=model.error / counted_share(self.valid))
 
@@ -170,15 +170,16 @@ class Judgement:
         return replace(self, shares=few, views=round(views))
 
     def model(
-        self, mesh: TetMesh, field: Field | ScalarField, deterministic: bool, face_steps: torch.Tensor | None = None
+        self, mesh: TetMesh, field: Field | ScalarField, deterministic: bool, hats: HatChoice | None = None
     ) -> ImageModel:
-        """Quadratic models of the squared error, means over the views; see `model_image` for the steps."""
+        """Quadratic models of the squared error, means over the views; see `model_image` for the hats."""
         sums = []
         for share in self.shares:
-            models = (part.model(mesh, field, deterministic, face_steps) for part in share)
+            models = (part.model(mesh, field, deterministic, hats) for part in share)
             sums.append(reduce(add, models).scaled(self._weight(share[0])))  # all of a share have as many views
         # A process may have nothing to do, and still takes part in the sum.
-        return self.processes.sum(reduce(add, sums) if sums else ImageModel.zero(mesh, face_steps is not None))
+        has_steps = hats is not None and hats.face_steps is not None
+        return self.processes.sum(reduce(add, sums) if sums else ImageModel.zero(mesh, has_steps))
 
     def error(self, mesh: TetMesh, field: Field | ScalarField) -> float:
         """Mean squared error."""

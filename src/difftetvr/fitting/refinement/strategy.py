@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
     from difftetvr.mesh.changes.change import MeshChange
     from difftetvr.mesh.tetmesh import TetMesh
-    from difftetvr.rendering.gauss_newton import ImageModel
+    from difftetvr.rendering.gauss_newton import HatChoice, ImageModel
 
 USUAL_VIEWS = 12
 """Views that a refinement is judged on where a strategy does not say how many."""
@@ -45,8 +45,8 @@ class Moment:
 class Model(Protocol):
     """The quadratic models of an error, made when they are asked for; see `Situation`."""
 
-    def __call__(self, steps: torch.Tensor | None) -> ImageModel:
-        """The models; of faces along (F, 4) steps alone, where some are given."""
+    def __call__(self, hats: HatChoice) -> ImageModel:
+        """The models of some hats."""
         ...
 
 
@@ -67,7 +67,7 @@ class Situation:
         values: (V, 4) parameters of its vertices: linear RGB in [0, 1], and density in units of the capture's.
         moment: Where the run stands.
         model: The mean over some random training views of the squared error and its quadratic models, in the units of
-            ``values``. It takes None, or (F, 4) the only step of each face's hat that is of interest, in these units.
+            ``values``. It takes which hats are of interest, with steps in these units.
         color_gradients: The sum over all training views of the absolute derivatives of the loss with respect to
             each vertex's colour, (V,).
         free_space: Where densities stay 0.

@@ -29,7 +29,7 @@ from difftetvr.inverse.variation import total_variation
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.optics.transfer_function import TransferFunction
 from difftetvr.rendering import ScalarField, render
-from difftetvr.rendering.gauss_newton import ImageModel
+from difftetvr.rendering.gauss_newton import HatChoice, ImageModel
 
 _FUNCTION = "function."  # prefix of the knots' state in a checkpoint
 _REACH = 0.1
@@ -252,8 +252,8 @@ class ScalarReconstruction(AdaptiveRun):
             self.config.refinement_random(self.iteration),
         ).together()
 
-        def model(steps: torch.Tensor | None) -> ImageModel:
-            return judgement.model(mesh, self.field(), self.config.deterministic, steps)
+        def model(hats: HatChoice) -> ImageModel:
+            return judgement.model(mesh, self.field(), self.config.deterministic, hats)
 
         situation, judges = self._situation(self.scalars.values, model, reach=_REACH), judgement.some()
         self._refine_by(self.strategy, situation, lambda: judges.error(self.mesh, self.field()))

@@ -12,7 +12,7 @@ from difftetvr.inverse.tomography.measurements import PixelSet
 from difftetvr.mesh.field import Field
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.rendering import render
-from difftetvr.rendering.gauss_newton import ImageModel, model_line_integrals
+from difftetvr.rendering.gauss_newton import HatChoice, ImageModel, model_line_integrals
 
 _CROSSINGS = 400.0
 """How often a cell is crossed, on average, by the rays of all pixels, as for photographs."""
@@ -41,23 +41,22 @@ class Judgement:
         """A few of the views: enough to see what became of the error."""
         return Judgement(self.parts[: max(1, len(self.parts) // 4)], self.likelihood, self.deterministic)
 
-    def model(self, mesh: TetMesh, density: torch.Tensor, unit: float, face_steps: torch.Tensor | None) -> ImageModel:
+    def model(self, mesh: TetMesh, density: torch.Tensor, unit: float, hats: HatChoice) -> ImageModel:
         """Quadratic models of the mean loss.
 
         Args:
             mesh: The mesh.
             density: (V,) densities per unit of length.
             unit: What densities are counted in, in the models and steps.
-            face_steps: (F, 4) the one step of each face that is looked at, of which the last number is density.
+            hats: Edges and steps of faces that are looked at.
         """
-        faces = mesh.topology.faces.shape[0]
-        steps = density.new_zeros(faces) if face_steps is None else unit * face_steps[:, 3].to(density)
+        hats = hats.from_density_unit(unit)
         total: ImageModel | None = None
         share = 1.0 / self._count
         for part in self.parts:
             residuals = self._residuals(mesh, density, part)
             errors = share * residuals.slope, share * residuals.curvature
-            model = model_line_integrals(mesh, density, part.camera, errors, steps, self.deterministic)
+            model = model_line_integrals(mesh, density, part.camera, errors, hats, self.deterministic)
             total = model if total is None else total + model
         assert total is not None
         return total.with_density_unit(unit)

@@ -31,7 +31,7 @@ from difftetvr.mesh.field import Field
 from difftetvr.mesh.making.generators import grid_cubes
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.rendering import render
-from difftetvr.rendering.gauss_newton import ImageModel
+from difftetvr.rendering.gauss_newton import HatChoice, ImageModel
 
 _GLANCED_RAYS = 16_384
 _PENALTY_EVERY = 4
@@ -232,8 +232,8 @@ class Reconstruction(AdaptiveRun):
         parts = self._pixels_to_judge(self._judged_views, Judgement.wanted(mesh))
         judgement = Judgement(parts, self.config.likelihood, self.config.deterministic)
 
-        def model(steps: torch.Tensor | None) -> ImageModel:
-            return judgement.model(mesh, densities.detached(), densities.unit, steps)
+        def model(hats: HatChoice) -> ImageModel:
+            return judgement.model(mesh, densities.detached(), densities.unit, hats)
 
         situation, judges = self._situation(densities.values, model, self._outside), judgement.some()
         self._refine_by(self.strategy, situation, lambda: judges.error(self.mesh, densities.detached()))

@@ -12,10 +12,10 @@ from difftetvr.memory import tried_twice
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.recording import eager
 from difftetvr.rendering.api import as_background
+from difftetvr.rendering.gauss_newton.choice import HatChoice
 from difftetvr.rendering.gauss_newton.models import HatDerivatives, ImageModel, StepDerivatives
 from difftetvr.rendering.kernels.composition import Composition
 from difftetvr.rendering.kernels.forward import render_forward
-from difftetvr.rendering.kernels.hats.kernel import STEP_RECORD, HatSpace
 from difftetvr.rendering.kernels.hats.light import RECORD, HatImage, hat_records
 from difftetvr.rendering.kernels.hats.scalars import RECORD as SCALAR_RECORD
 from difftetvr.rendering.kernels.hats.scalars import scalar_hat_records
@@ -37,7 +37,7 @@ def model_image(
     transmittance_threshold: float = 1e-4,
     deterministic: bool = False,
     valid: torch.Tensor | None = None,
-    face_steps: torch.Tensor | None = None,
+    hats: HatChoice | None = None,
 ) -> ImageModel:
     """Renders a view, and predicts what changes of the mesh would do to its squared error.
 
@@ -54,8 +54,7 @@ def model_image(
         transmittance_threshold: Rays stop once their transmittance is at or below this value.
         deterministic: Whether sums are the same in every run to the last bit, see :func:`difftetvr.render`.
         valid: (H, W) bool, pixels that have an error; None: all. The curvature counts all of them.
-        face_steps: (F, 4) the one step of each face's hat that is looked at, (r, g, b, density), in the order of
-            ``mesh.topology.faces``: a third less work than for all steps. Steps of 0 cost nothing.
+        hats: Edges and steps of faces that are looked at; None: all.
 
     Returns:
         The model, in the precision and on the device of the mesh.
@@ -69,7 +68,9 @@ def model_image(
     options = ViewOptions(transmittance_threshold=transmittance_threshold, deterministic=deterministic)
     view = _prepared(mesh, field, camera, options)
     truth = as_reals(truth, "The true image", DiffTetError)
-    _require_shapes(view, mesh, truth, valid, face_steps)
+    hats = HatChoice() if hats is None else hats
+    require_type(hats, HatChoice, "hats", "pass a HatChoice", DiffTetError)
+    _require_shapes(view, mesh, truth, valid, hats)
     behind = as_background(background, mesh.vertices)
     backend = view.task.backend
     tracer = view.tracer(view.ends)
@@ -81,30 +82,31 @@ def model_image(
         if valid is not None:
             residual = residual * valid.to(residual.device)[..., None]
         curvature = 2.0 / residual.numel()
-        hats = (_LightModels if isinstance(field, Field) else _ScalarModels)(view, face_steps)
-        vertices, edges, faces = hats.records(tracer, mesh, (image, curvature * residual), deterministic)
+        models = (_LightModels if isinstance(field, Field) else _ScalarModels)(view, hats)
+        vertices, edges, faces = models.records(tracer, mesh, (image, curvature * residual), deterministic)
+    has_steps = hats.face_steps is not None
     return ImageModel(
-        hats.models(view.upload.order.in_order_of_mesh(vertices), curvature),
-        hats.models(edges, curvature),
-        hats.models(faces, curvature) if face_steps is None else None,
+        models.of(vertices, curvature),
+        models.of(edges, curvature),
+        None if has_steps else models.of(faces, curvature),
         float(residual.square().mean()),
-        None if face_steps is None else StepDerivatives(faces[:, 0], curvature * faces[:, 1]),
+        StepDerivatives(faces[:, 0], curvature * faces[:, 1]) if has_steps else None,
     )
 
 
 class _LightModels:
     """Hats of colours and densities: what kernels are asked, and what their records say."""
 
-    width = RECORD
+    floats = RECORD
     gather: Any = staticmethod(hat_records)
 
-    def __init__(self, view: PreparedView, face_steps: torch.Tensor | None) -> None:
-        self.view, self.face_steps = view, face_steps
+    def __init__(self, view: PreparedView, hats: HatChoice) -> None:
+        self.view, self.hats = view, hats
 
     def records(
         self, tracer: Tracer, mesh: TetMesh, image: tuple[torch.Tensor, torch.Tensor], in_order: bool
     ) -> list[torch.Tensor]:
-        """Records of vertices in the order of memory, of edges and faces in that of the mesh; of faces those of steps.
+        """Records of vertices, edges and faces in the order of the mesh; of faces those of steps, if there are any.
 
         Args:
             tracer: The view.
@@ -112,21 +114,17 @@ class _LightModels:
             image: (H, W, 3) radiance, and the derivative of the loss by it.
             in_order: Whether sums have a certain order.
         """
-        backend = self.view.task.backend
-        widths = [self.width, self.width, self.width if self.face_steps is None else STEP_RECORD]
-        space = HatSpace.of(mesh, self.view.upload.order, widths)
-        steps = None if self.face_steps is None else backend.floats(self.steps_of(self.face_steps))
+        backend, face_steps = self.view.task.backend, self.hats.face_steps
+        space = self.hats.space(self.view, mesh, self.floats)
+        steps = None if face_steps is None else backend.floats(self.steps_of(space.faces.values(face_steps)))
         color, gradient = (backend.floats(part) for part in image)
-        found = self.gather(tracer, HatImage(color, gradient, steps), space, in_order)
-        counts = (mesh.num_vertices, mesh.topology.edges.shape[0], mesh.topology.faces.shape[0])
-        arrays = zip((found.vertices, found.edges, found.faces), widths, counts, strict=True)
-        return [backend.tensor(array, -1, width)[:count] for array, width, count in arrays]
+        return space.tensors(self.gather(tracer, HatImage(color, gradient, steps), space, in_order))
 
     def steps_of(self, face_steps: torch.Tensor) -> torch.Tensor:
-        """Steps of faces as kernels read them, from (F, 4)."""
+        """Steps of faces as kernels read them, from (M, 4)."""
         return torch.cat((face_steps[:, :3], face_steps[:, 3:] * self.view.unit), 1)
 
-    def models(self, records: torch.Tensor, curvature: float) -> HatDerivatives:
+    def of(self, records: torch.Tensor, curvature: float) -> HatDerivatives:
         """Quadratic models from records.
 
         Args:
@@ -141,13 +139,13 @@ class _LightModels:
 class _ScalarModels(_LightModels):
     """Hats of scalars, likewise."""
 
-    width = SCALAR_RECORD
+    floats = SCALAR_RECORD
     gather = staticmethod(scalar_hat_records)
 
     def steps_of(self, face_steps: torch.Tensor) -> torch.Tensor:
         return face_steps[:, 3].contiguous()
 
-    def models(self, records: torch.Tensor, curvature: float) -> HatDerivatives:
+    def of(self, records: torch.Tensor, curvature: float) -> HatDerivatives:
         return HatDerivatives.of_density(records, curvature)
 
 
@@ -170,7 +168,7 @@ def _require_shapes(
     mesh: TetMesh,
     truth: torch.Tensor,
     valid: torch.Tensor | None,
-    face_steps: torch.Tensor | None,
+    hats: HatChoice,
 ) -> None:
     if len(view.shape) != 2 or truth.shape != (*view.shape, 3):
         wanted = f"takes {(*view.shape, 3)}" if len(view.shape) == 2 else f"sees {view.shape}, which is no image"
@@ -181,6 +179,4 @@ def _require_shapes(
         isinstance(valid, torch.Tensor) and valid.dtype == torch.bool and valid.shape == truth.shape[:2]
     ):
         raise DiffTetError(f"valid is {shown(valid)}; pass a bool tensor of shape {tuple(truth.shape[:2])}.")
-    if face_steps is not None and face_steps.shape != (mesh.topology.faces.shape[0], 4):
-        count = mesh.topology.faces.shape[0]
-        raise DiffTetError(f"face_steps has shape {tuple(face_steps.shape)}; this mesh takes {(count, 4)}.")
+    hats.require_fit(mesh)

@@ -8,9 +8,9 @@ from difftetvr.errors import DiffTetError
 from difftetvr.memory import tried_twice
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.recording import eager
+from difftetvr.rendering.gauss_newton.choice import HatChoice
 from difftetvr.rendering.gauss_newton.models import HatDerivatives, ImageModel, StepDerivatives
 from difftetvr.rendering.kernels.hats.absorption import RECORD, IntegralErrors, absorption_records
-from difftetvr.rendering.kernels.hats.kernel import STEP_RECORD, HatSpace
 from difftetvr.rendering.preparation import ViewOptions, prepare_view
 from difftetvr.rendering.rays import Rays, RaySource
 
@@ -23,7 +23,7 @@ def model_line_integrals(
     density: torch.Tensor,
     camera: RaySource | Rays,
     errors: tuple[torch.Tensor, torch.Tensor],
-    face_steps: torch.Tensor,
+    hats: HatChoice,
     deterministic: bool = False,
 ) -> ImageModel:
     """Predicts what changes of the mesh would do to a loss of its line integrals.
@@ -36,8 +36,7 @@ def model_line_integrals(
         density: (V,) densities of its vertices, on its device.
         camera: Camera of the view, or rays of any shape (...).
         errors: (...) first and second derivatives of the loss by each line integral.
-        face_steps: (F,) the one step of density of each face's hat that is looked at, in the order of
-            ``mesh.topology.faces``. Steps of 0 cost nothing.
+        hats: Edges and steps of faces that are looked at; of a step the density.
         deterministic: Whether sums are the same in every run to the last bit, see :func:`difftetvr.render`.
 
     Returns:
@@ -45,35 +44,28 @@ def model_line_integrals(
 
     Raises:
         MeshError: The densities do not fit the mesh, or are invalid.
-        DiffTetError: An argument has a wrong shape, or there is no ray.
+        DiffTetError: An argument has a wrong shape, there is no ray, or there are no steps of faces.
         BackendError: No back end runs on the device of the mesh.
     """
-    topology = mesh.topology
     view = prepare_view(mesh, Field(density.new_zeros(len(density), 0), density, "vertex"), camera, ViewOptions())
-    wanted = [(view.shape, errors[0]), (view.shape, errors[1]), ((topology.faces.shape[0],), face_steps)]
-    for shape, tensor in wanted:
-        if tuple(tensor.shape) != tuple(shape):
-            raise DiffTetError(f"A derivative or step has shape {tuple(tensor.shape)}; this view takes {tuple(shape)}.")
+    for tensor in errors:
+        if tuple(tensor.shape) != tuple(view.shape):
+            raise DiffTetError(f"A derivative has shape {tuple(tensor.shape)}; this view takes {tuple(view.shape)}.")
     if 0 in view.shape:
         raise DiffTetError(f"The view has the shape {view.shape}, so it says nothing; pass one of a ray at least.")
+    if hats.face_steps is None:
+        raise DiffTetError("No steps of faces are passed, and line integrals have no models of all of them; pass some.")
+    hats.require_fit(mesh)
     backend = view.task.backend
     tracer = view.tracer(view.ends)
     with backend.exclusive(deterministic):
-        slopes, curvatures, steps = (
-            backend.floats(part.reshape(-1)) for part in (*errors, face_steps.to(mesh.vertices) * view.unit)
-        )
-        space = HatSpace.of(mesh, view.upload.order, [RECORD, RECORD, STEP_RECORD])
+        space = hats.space(view, mesh, RECORD)
+        density_steps = space.faces.values(hats.face_steps)[:, 3].to(mesh.vertices) * view.unit
+        slopes, curvatures, steps = (backend.floats(part.reshape(-1)) for part in (*errors, density_steps))
         records = absorption_records(tracer, IntegralErrors(slopes, curvatures, steps), space, deterministic)
-        rows, edges, faces = (
-            backend.tensor(part, -1, 2)[:count]
-            for part, count in (
-                (records.vertices, mesh.num_vertices),
-                (records.edges, topology.edges.shape[0]),
-                (records.faces, topology.faces.shape[0]),
-            )
-        )
+        rows, edges, faces = space.tensors(records)
     return ImageModel(
-        HatDerivatives.of_density(view.upload.order.in_order_of_mesh(rows)).with_density_unit(view.unit),
+        HatDerivatives.of_density(rows).with_density_unit(view.unit),
         HatDerivatives.of_density(edges).with_density_unit(view.unit),
         None,
         0.0,

@@ -15,12 +15,11 @@ from difftetvr.rendering.kernels.hats.kernel import (
     SAMPLES,
     HatKernel,
     HatRay,
-    HatRecords,
-    HatSpace,
     HatSums,
     Response,
     gathered_records,
 )
+from difftetvr.rendering.kernels.hats.space import HatRecords, HatSpace
 from difftetvr.rendering.kernels.hats.tables import HatTables
 from difftetvr.rendering.traversal.crossing import Tracer
 from difftetvr.rendering.traversal.rays import Lanes
@@ -36,7 +35,7 @@ class IntegralErrors:
     Attributes:
         slopes: (N,) derivative of the loss with respect to each line integral.
         curvatures: (N,) second derivative.
-        face_steps: (F,) the one step of density that is looked at of each face.
+        face_steps: (M,) the one step of density that is looked at of each face that has a record.
     """
 
     slopes: Any
@@ -50,7 +49,7 @@ def absorption_records(tracer: Tracer, errors: IntegralErrors, space: HatSpace, 
     Args:
         tracer: The view, to be walked through; its densities live on vertices.
         errors: What is known of its line integrals.
-        space: What there are hats of, with records of `RECORD`, `RECORD` and `STEP_RECORD` floats.
+        space: What there are hats of, of which `RECORD` floats are known; of faces those of their steps.
         in_order: Whether sums over rays have a certain order, see :mod:`difftetvr.rendering.kernels.shares`.
     """
     return gathered_records(_AbsorptionHats, tracer, errors, space, in_order)
@@ -80,7 +79,6 @@ class _AbsorptionHats(HatKernel):
         (d,) = response
         return [self.slope * d, self.curvature * d * d]
 
-    def step_record(self, face: Any, response: Response) -> tuple[list[Any], Any]:
+    def step_record(self, face: Any, response: Response) -> list[Any]:
         step = dr.gather(self.view.backend.Float, self.face_steps, face)
-        change = response[0] * step
-        return [self.slope * change, self.curvature * change * change], step != 0
+        return self.record([response[0] * step])

@@ -22,11 +22,10 @@ from typing import Any
 
 import drjit as dr
 
-from difftetvr.mesh import TetMesh
-from difftetvr.recording import few_lengths, replayed
+from difftetvr.recording import replayed
+from difftetvr.rendering.kernels.hats.space import HatRecords, HatSpace
 from difftetvr.rendering.kernels.hats.tables import HatTables, RankedCell, ranks_of
 from difftetvr.rendering.kernels.shares import Deal
-from difftetvr.rendering.search.memory_order import MemoryOrder
 from difftetvr.rendering.traversal.crossing import (
     Span,
     Step,
@@ -38,9 +37,6 @@ from difftetvr.rendering.traversal.crossing import (
 from difftetvr.rendering.traversal.rays import Lanes
 from difftetvr.rendering.traversal.sums import Copies, Sums
 from difftetvr.rendering.traversal.walk import Corner, Exit, Face
-
-STEP_RECORD = 2
-"""Floats a step: derivative of the error, and sum of the squared responses."""
 
 SAMPLES = 4
 """Pieces of a crossing on which hats, colour and density are taken as constant."""
@@ -55,25 +51,18 @@ Response = list[Any]  # of light B, D_r, D_g, D_b
 
 
 @dataclass
-class HatRecords:
-    """Flat arrays of a record for each vertex, edge and face."""
-
-    vertices: Any
-    edges: Any
-    faces: Any
-
-
-@dataclass
 class HatSums:
     """What the kernel adds to to make them."""
 
     vertices: Sums
     edges: Sums
     faces: Sums
+    width: int  # of a record, but of those of steps
 
     def of_copy(self, copy: Any | None) -> HatSums:
         """The same for lanes that each add to a copy of their own."""
-        return HatSums(*(sums.of_copy(copy) for sums in (self.vertices, self.edges, self.faces)))
+        vertices, edges, faces = (sums.of_copy(copy) for sums in (self.vertices, self.edges, self.faces))
+        return HatSums(vertices, edges, faces, self.width)
 
 
 @dataclass
@@ -118,29 +107,6 @@ class _Samples:
         return total
 
 
-@dataclass(frozen=True)
-class HatSpace:
-    """What there are hats of.
-
-    Attributes:
-        mesh: The mesh that is seen.
-        order: Its order in memory.
-        counts: Numbers of vertices, edges and faces that there is room for.
-        widths: Floats of a record of each.
-    """
-
-    mesh: TetMesh
-    order: MemoryOrder
-    counts: list[int]
-    widths: list[int]
-
-    @staticmethod
-    def of(mesh: TetMesh, order: MemoryOrder, widths: list[int]) -> HatSpace:
-        """All hats of a mesh; few different numbers, for kernels are compiled for them."""
-        counts = (mesh.num_vertices, mesh.topology.edges.shape[0], mesh.topology.faces.shape[0])
-        return HatSpace(mesh, order, [few_lengths(n) for n in counts], widths)
-
-
 def gathered_records(kernel: Any, tracer: Tracer, asked: Any, space: HatSpace, in_order: bool) -> HatRecords:
     """Sums over the rays of a view.
 
@@ -154,8 +120,9 @@ def gathered_records(kernel: Any, tracer: Tracer, asked: Any, space: HatSpace, i
     view = tracer.view
     sizes = [count * width for count, width in zip(space.counts, space.widths, strict=True)]
     deal, pairs = Deal.of(tracer, sum(sizes), in_order), zip(sizes, space.widths, strict=True)
-    buffers = _Buffers(sizes, [Copies.of(view.backend, deal.copies, size, width) for size, width in pairs])
-    tables = HatTables.of(view, space.mesh, space.order)
+    copies = [Copies.of(view.backend, deal.copies, size, width) for size, width in pairs]
+    buffers = _Buffers(sizes, copies, space.width)
+    tables = HatTables.of(view, space.mesh, space.order, space.edges, space.faces)
     with view.backend.on_threads(deal.threads):
         records: HatRecords = replayed(_records, kernel, tracer, tables, asked, deal, buffers)
     return records
@@ -163,22 +130,23 @@ def gathered_records(kernel: Any, tracer: Tracer, asked: Any, space: HatSpace, i
 
 @dataclass
 class _Buffers:
-    """Numbers of floats, and where copies are; None where there is but one."""
+    """Numbers of floats, where copies are, None where there is but one, and the floats of a record."""
 
     sizes: list[int]
     copies: list[Copies | None]
+    width: int
 
 
 def _records(kernel: Any, tracer: Tracer, tables: HatTables, asked: Any, deal: Deal, buffers: _Buffers) -> HatRecords:
     backend, pairs = tracer.view.backend, zip(buffers.sizes, buffers.copies, strict=True)
-    parts = [Sums.zeros(backend, size, copies, deal.mode) for size, copies in pairs]
-    sums = HatSums(*parts)
+    vertices, edges, faces = (Sums.zeros(backend, size, copies, deal.mode) for size, copies in pairs)
+    sums = HatSums(vertices, edges, faces, buffers.width)
 
     def run(part: Tracer, copy: Any | None) -> None:
         part.trace(lambda rays: kernel(part, rays, tables, sums.of_copy(copy), asked))
 
     deal.trace(tracer, run)
-    totals = HatRecords(*(part.total() for part in parts))
+    totals = HatRecords(vertices.total(), edges.total(), faces.total())
     dr.eval(totals)
     return totals
 
@@ -216,8 +184,8 @@ class HatKernel:
         """What is added to a hat's record."""
         raise NotImplementedError
 
-    def step_record(self, face: Any, response: Response) -> tuple[list[Any], Any]:
-        """What is added to the record of a face's one step, and where it is asked for."""
+    def step_record(self, face: Any, response: Response) -> list[Any]:
+        """What is added to the record of a face's one step."""
         raise NotImplementedError
 
     def start(self) -> HatRay:
@@ -260,7 +228,7 @@ class HatKernel:
         for corner in face.corners:
             self._scatter(self.records.vertices, corner.vertex, corner.adjoints, active)
         for edge, response in zip(ray.edge_ids, ray.edges, strict=True):
-            self._scatter(self.records.edges, edge, response, active & (edge != _UNKNOWN))
+            self._scatter_edge(edge, response, active & (edge != _UNKNOWN))
         # A face on the boundary cannot be flipped, so its record is of no use.
         fresh = self.start()
         return HatRay(ray.transmittance, ray.rest, fresh.edges, fresh.edge_ids, fresh.face)
@@ -300,7 +268,7 @@ class HatKernel:
             old.append([edge, *_plus(row[1:], samples.respond(*corners))])
         new = [[cell.edge(k, _APEX), *samples.respond(k, _APEX)] for k in (_DROPPED, _AFTER, _BEFORE)]
         for edge, *response in (new[_DROPPED], old[_AFTER], old[_BEFORE]):
-            self._scatter(self.records.edges, edge, response, True)
+            self._scatter_edge(edge, response)
         # The apex takes the dropped corner's place: opposite it lies what lay opposite that one.
         kept = _turned_back(exit_, [old[_DROPPED], new[_BEFORE], new[_AFTER]])
         return [row[1:] for row in kept], [row[0] for row in kept]
@@ -313,16 +281,23 @@ class HatKernel:
             self._scatter_face(cell.face(opposite), samples.respond(_DROPPED, other, _APEX))
         return samples.respond(_AFTER, _BEFORE, _APEX)
 
+    def _scatter_edge(self, edge: Any, response: Response, active: Any = True) -> None:
+        limit = self.tables.asked_edges
+        self._scatter(self.records.edges, edge, response, active if limit is None else active & (edge < limit))
+
     def _scatter_face(self, face: Any, response: Response) -> None:
+        limit = self.tables.asked_faces
+        is_asked = True if limit is None else face < limit
         if not self.has_steps:
-            self._scatter(self.records.faces, face, response, True)
+            self._scatter(self.records.faces, face, response, is_asked)
             return
-        record, is_asked = self.step_record(face, response)
-        self.records.faces.add(self.view.backend.Floats(record), face, is_asked)
+        self.records.faces.add(self.view.backend.Floats(self.step_record(face, response)), face, is_asked)
 
     def _scatter(self, sums: Sums, index: Any, response: Response, active: Any) -> None:
         # In one piece: on GPUs, threads of a warp that share a record have to find each other but once.
-        sums.add(self.view.backend.Floats(self.record(response)), index, active)
+        record = self.record(response)
+        padding = [dr.zeros_like(record[0])] * (self.records.width - len(record))
+        sums.add(self.view.backend.Floats(record + padding), index, active)
 
     def _no_response(self) -> Response:
         return [dr.zeros(self.view.backend.Float, dr.width(self.rays.pixel)) for _ in range(self.slots)]

@@ -15,18 +15,17 @@ from difftetvr.rendering.kernels.hats.kernel import (
     SAMPLES,
     HatKernel,
     HatRay,
-    HatRecords,
-    HatSpace,
     HatSums,
     Response,
     gathered_records,
 )
+from difftetvr.rendering.kernels.hats.space import HatRecords, HatSpace
 from difftetvr.rendering.kernels.hats.tables import HatTables
 from difftetvr.rendering.traversal.crossing import Tracer
 from difftetvr.rendering.traversal.rays import Lanes
 
-RECORD = 12
-"""Floats a hat: colour gradient (3), density gradient, sums of B^2, B D (3), D^2, B, and two of padding."""
+RECORD = 10
+"""Floats a hat: colour gradient (3), density gradient, sums of B^2, B D (3), D^2, and B."""
 
 
 @dataclass
@@ -36,7 +35,8 @@ class HatImage:
     Attributes:
         color: (H, W, 3) radiance over the background.
         gradient: (H, W, 3) derivative of the loss with respect to it.
-        face_steps: (F, 4) the one step that is looked at of each face, or (F,) of hats of scalars; None for all.
+        face_steps: (M, 4) the one step that is looked at of each face that has a record, or (M,) of hats of scalars;
+            None for all.
     """
 
     color: Any
@@ -50,7 +50,7 @@ def hat_records(tracer: Tracer, image: HatImage, space: HatSpace, in_order: bool
     Args:
         tracer: The view, to be walked through; its field lives on vertices.
         image: The rendered image, and the derivative of the loss with respect to it.
-        space: What there are hats of, with records of `RECORD` floats.
+        space: What there are hats of, of which `RECORD` floats are known.
         in_order: Whether sums over rays have a certain order, see :mod:`difftetvr.rendering.kernels.shares`.
     """
     return gathered_records(_LightHats, tracer, image, space, in_order)
@@ -116,16 +116,15 @@ class _LightHats(ImageHats):
 
     def record(self, response: Response) -> list[Any]:
         b, d, g = response[0], response[1:], self.gradient
-        zero = dr.zeros_like(b)
         slope = dr.fma(g[0], d[0], dr.fma(g[1], d[1], g[2] * d[2]))
         square = dr.fma(d[0], d[0], dr.fma(d[1], d[1], d[2] * d[2]))
-        return [g[0] * b, g[1] * b, g[2] * b, slope, b * b, *(b * v for v in d), square, b, zero, zero]
+        return [g[0] * b, g[1] * b, g[2] * b, slope, b * b, *(b * v for v in d), square, b]
 
-    def step_record(self, face: Any, response: Response) -> tuple[list[Any], Any]:
+    def step_record(self, face: Any, response: Response) -> list[Any]:
         *color, density = dr.gather(self.view.backend.Float4, self.face_steps, face)
         changes = [dr.fma(response[0], c, d * density) for c, d in zip(color, response[1:], strict=True)]
         slope, square = (
             dr.fma(one[0], changes[0], dr.fma(one[1], changes[1], one[2] * changes[2]))
             for one in (self.gradient, changes)
         )
-        return [slope, square], (density != 0) | (color[0] != 0) | (color[1] != 0) | (color[2] != 0)
+        return [slope, square]

@@ -14,13 +14,12 @@ from difftetvr.rendering.kernels.hats.kernel import (
     PLACES,
     SAMPLES,
     HatRay,
-    HatRecords,
-    HatSpace,
     HatSums,
     Response,
     gathered_records,
 )
 from difftetvr.rendering.kernels.hats.light import HatImage, ImageHats, pass_piece
+from difftetvr.rendering.kernels.hats.space import HatRecords, HatSpace
 from difftetvr.rendering.kernels.hats.tables import HatTables
 from difftetvr.rendering.traversal.crossing import Tracer
 from difftetvr.rendering.traversal.rays import Lanes
@@ -39,7 +38,7 @@ def scalar_hat_records(tracer: Tracer, image: HatImage, space: HatSpace, in_orde
     Args:
         tracer: The view, to be walked through; its scalars live on vertices.
         image: The rendered image, and the derivative of the loss with respect to it.
-        space: What there are hats of, with records of `RECORD` floats.
+        space: What there are hats of, of which `RECORD` floats are known.
         in_order: Whether sums over rays have a certain order, see :mod:`difftetvr.rendering.kernels.shares`.
     """
     return gathered_records(_ScalarHats, tracer, image, space, in_order)
@@ -89,6 +88,6 @@ class _ScalarHats(ImageHats):
         )
         return [slope, square]
 
-    def step_record(self, face: Any, response: Response) -> tuple[list[Any], Any]:
+    def step_record(self, face: Any, response: Response) -> list[Any]:
         step = dr.gather(self.view.backend.Float, self.face_steps, face)
-        return self.record([step * r for r in response]), step != 0
+        return self.record([step * r for r in response])
