@@ -1,17 +1,19 @@
-"""One more try where a GPU's memory is kept by an allocator that does not need it."""
+"""Freed memory that is kept: by choice, and by an allocator of a GPU that does not need it."""
 
 from __future__ import annotations
 
 import gc
 import os
+import platform
 import weakref
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 import torch
 
 from difftetvr.backend import dr, get_backend
-from difftetvr.memory import tried_twice
+from difftetvr.memory import kept, tried_twice
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.rendering import Camera, render
 
@@ -129,3 +131,20 @@ def test_a_rendering_survives_a_card_that_is_full_until_caches_are_given_back(
 
     get_backend("cuda")
     torch.testing.assert_close(gradient(step), gradient())
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries keep what they like")
+def test_large_blocks_are_kept_for_the_next_and_given_back_in_the_end():
+    floats, size = 1 << 25, 1 << 27
+
+    def resident() -> int:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+    with kept():
+        place = torch.ones(floats).data_ptr()
+        freed = resident()
+        again = torch.ones(floats)
+        assert again.data_ptr() == place and resident() < freed + size // 2
+        del again
+        assert resident() > freed - size // 2
+    assert resident() < freed - size // 2

@@ -13,6 +13,7 @@ from typing import Any, Protocol
 
 import torch
 
+from difftetvr import memory
 from difftetvr.capture.capture import Capture
 from difftetvr.errors import FitError, shown
 from difftetvr.fitting.config import FitConfig
@@ -138,7 +139,7 @@ def optimise(
         FitError: The checkpoint cannot be written, or the loss is not finite.
         KeyboardInterrupt: The run was interrupted; the checkpoint is saved.
     """
-    with one_torch_thread():
+    with one_torch_thread(), memory.kept():
         iterate(trainer, path, on_progress)
         tested: list[int] = trainer.capture.test_indices.tolist()
         trainer.align(tested)

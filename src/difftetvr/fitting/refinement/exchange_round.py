@@ -17,7 +17,7 @@ from difftetvr.fitting.refinement.gains import (
     vanishing_edges,
 )
 from difftetvr.fitting.refinement.strategy import Refinement, Situation
-from difftetvr.mesh.arrays import true_indices
+from difftetvr.mesh.arrays import chunks, true_indices
 from difftetvr.mesh.boundary import removable_vertices
 from difftetvr.mesh.changes.bisection import bisect_edges, independent_edges, long_edges
 from difftetvr.mesh.changes.change import MeshChange
@@ -161,9 +161,13 @@ class _Round:
 
 def _changed_cells(mesh: TetMesh, change: MeshChange) -> torch.Tensor:
     """Cells after a change that adds no vertices which have other corners than before."""
-    before = mesh.tets[change.cell_parents.long()]
-    after = change.parents[:, 0][change.mesh.tets.long()]
-    return true_indices((before != after).any(1))
+    new, parents, olds = change.mesh.tets, change.cell_parents, change.parents[:, 0]
+    has_changed = torch.empty(len(new), dtype=torch.bool, device=new.device)
+    for part in chunks(len(new), new.device, width=4):
+        before = mesh.tets.index_select(0, parents[part])
+        after = olds.index_select(0, new[part].view(-1)).view_as(before)
+        has_changed[part] = (before != after).any(1)
+    return true_indices(has_changed)
 
 
 def _cost_of(costs: CollapseCosts, mesh: TetMesh, change: MeshChange) -> float:

@@ -10,6 +10,7 @@ from pathlib import Path
 from types import NoneType
 from typing import Any
 
+from difftetvr import memory
 from difftetvr.capture.capture import Capture
 from difftetvr.errors import FitError
 from difftetvr.fitting.beginning.starting_mesh import starting_mesh
@@ -163,7 +164,7 @@ def optimise(
         path: Checkpoint to write.
         on_progress: Called after every iteration.
     """
-    with one_torch_thread():
+    with one_torch_thread(), memory.kept():
         iterate(run, path, on_progress)
         evaluation = run.evaluate(run.capture.test_indices.tolist())
     return ScalarResult(run.mesh, run.field(), evaluation, run.history, run.config)

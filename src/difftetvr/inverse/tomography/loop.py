@@ -10,6 +10,7 @@ from pathlib import Path
 from types import NoneType
 from typing import Any
 
+from difftetvr import memory
 from difftetvr.capture.projections.projection_capture import ProjectionCapture
 from difftetvr.errors import FitError
 from difftetvr.fitting.loop import iterate, one_torch_thread
@@ -129,7 +130,7 @@ def optimise(
         on_progress: Called after every iteration.
         on_solve: Called after every step of the solver.
     """
-    with one_torch_thread():
+    with one_torch_thread(), memory.kept():
         iterate(run, path, on_progress)
         if run.config.solve_steps:
             run.solve(on_solve)

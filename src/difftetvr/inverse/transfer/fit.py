@@ -15,6 +15,7 @@ from typing import Any
 
 import torch
 
+from difftetvr import memory
 from difftetvr.capture.capture import Capture
 from difftetvr.capture.truth import BLACK, WHITE, Truth
 from difftetvr.errors import CaptureError, FitError, MeshError, shown
@@ -140,7 +141,7 @@ def fit_transfer(
         if path is not None and resume and path.exists():
             run.resume(path)
         run.require_something_seen()
-        with one_torch_thread():
+        with one_torch_thread(), memory.kept():
             iterate(run, path, on_progress)
         return run.result()
 

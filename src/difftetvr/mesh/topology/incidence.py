@@ -61,20 +61,11 @@ def find_edges(topology: Topology, ends: torch.Tensor) -> torch.Tensor:
     edges = topology.edges
     if not edges.shape[0]:
         return torch.full_like(ends[:, 0], -1)
-    offsets, higher = topology.cached("incidence.edge_rows", lambda: _edge_rows(topology))
-    one, other = ends.int().unbind(1)
-    low, high = torch.minimum(one, other), torch.maximum(one, other)
-    # Halving the edges of the lower end: they are so few that this takes a fraction of a search among all edges.
-    place = offsets.index_select(0, low)
-    left = offsets.index_select(0, low + 1) - place
-    is_known = left > 0
-    for _ in range((int(left.max()) - 1).bit_length() if left.numel() else 0):
-        half = left >> 1
-        is_before = higher.index_select(0, (place + half).sub_(1).clamp_min_(0)) < high
-        place.add_(half * is_before)
-        left.sub_(half)
-    is_known &= higher.index_select(0, place.clamp_max_(edges.shape[0] - 1)) == high
-    return torch.where(is_known, place.long(), -1)
+    rows = topology.cached("incidence.edge_rows", lambda: _edge_rows(topology))
+    found = torch.empty(ends.shape[0], dtype=torch.int64, device=ends.device)
+    for part in chunks(ends.shape[0], ends.device):
+        found[part] = _places_in_rows(*rows, ends[part])
+    return found
 
 
 def known_edges(topology: Topology, edges: torch.Tensor) -> torch.Tensor:
@@ -172,6 +163,23 @@ def _edge_rows(topology: Topology) -> tuple[torch.Tensor, torch.Tensor]:
     lower, higher = topology.edges.unbind(1)
     counts = torch.bincount(lower, minlength=topology.num_vertices)
     return torch.nn.functional.pad(counts.cumsum(0), (1, 0)).int(), higher.contiguous()
+
+
+def _places_in_rows(offsets: torch.Tensor, higher: torch.Tensor, ends: torch.Tensor) -> torch.Tensor:
+    """(N,) int64 place of pairs of vertices among the edges, of which there is one at least; -1 for others."""
+    one, other = ends.int().unbind(1)
+    low, high = torch.minimum(one, other), torch.maximum(one, other)
+    # Halving the edges of the lower end: they are so few that this takes a fraction of a search among all edges.
+    place = offsets.index_select(0, low)
+    left = offsets.index_select(0, low + 1) - place
+    is_known = left > 0
+    for _ in range((int(left.max()) - 1).bit_length()):
+        half = left >> 1
+        is_before = higher.index_select(0, (place + half).sub_(1).clamp_min_(0)) < high
+        place.add_(half * is_before)
+        left.sub_(half)
+    is_known &= higher.index_select(0, place.clamp_max_(higher.shape[0] - 1)) == high
+    return torch.where(is_known, place.long(), -1)
 
 
 def _build_cell_faces(topology: Topology) -> torch.Tensor:
