@@ -17,7 +17,7 @@ from difftetvr.fitting.refinement.gains import (
     vanishing_edges,
 )
 from difftetvr.fitting.refinement.strategy import Refinement, Situation
-from difftetvr.mesh.arrays import chunks, true_indices
+from difftetvr.mesh.arrays import chunks, sort_keys, true_indices
 from difftetvr.mesh.boundary import removable_vertices
 from difftetvr.mesh.changes.bisection import bisect_edges, independent_edges, long_edges
 from difftetvr.mesh.changes.change import MeshChange
@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 
 _LOOKED_AT = 5.0
 """Vertices whose collapse is priced, in units of those that may vanish."""
+
+_ROW_BITS = 32
 
 
 def exchange_cells(situation: Situation, target: int, options: Exchange) -> Refinement | None:
@@ -96,7 +98,7 @@ class _Round:
         self.flipped = len(chosen)
         self.predicted += float(flip_gains(chosen, self.values, model).sum())
         change = apply_flips(chosen)
-        self._carry_edges(change)
+        self._carry_edges(change, _changed_cells(self.mesh, change))
         self._apply(change)
 
     def collapse(self, model: ImageModel, options: Exchange) -> None:
@@ -113,8 +115,9 @@ class _Round:
             min_quality=options.min_quality,
             boundary=options.boundary,
         )
-        self.predicted -= _cost_of(costs, self.mesh, change)
-        self._carry_edges(change)
+        changed = _changed_cells(self.mesh, change)
+        self.predicted -= _cost_of(costs, self.mesh, change, changed)
+        self._carry_edges(change, changed)
         self._apply(change)
 
     def bisect(self, target: int, options: Exchange) -> None:
@@ -152,10 +155,10 @@ class _Round:
         self.values = change.carry(self.values)
         self.mesh = change.mesh
 
-    def _carry_edges(self, change: MeshChange) -> None:
-        """What was predicted for an edge holds while its cells are the same."""
+    def _carry_edges(self, change: MeshChange, changed: torch.Tensor) -> None:
+        """What was predicted for an edge holds while its cells are the same; those that are not are given."""
         before = edges_before(self.mesh.topology, change)
-        before[cell_edges(change.mesh.topology)[_changed_cells(self.mesh, change)].view(-1).long()] = -1
+        before[cell_edges(change.mesh.topology)[changed].view(-1).long()] = -1
         self.gains = self.gains.at(before)
 
 
@@ -170,13 +173,13 @@ def _changed_cells(mesh: TetMesh, change: MeshChange) -> torch.Tensor:
     return true_indices(has_changed)
 
 
-def _cost_of(costs: CollapseCosts, mesh: TetMesh, change: MeshChange) -> float:
-    """Sum of the predicted costs of the collapses that a change has made."""
-    cells = _changed_cells(mesh, change)
-    before = mesh.tets[change.cell_parents[cells].long()].long()
-    after = change.parents[:, 0][change.mesh.tets[cells].long()].long()
+def _cost_of(costs: CollapseCosts, mesh: TetMesh, change: MeshChange, changed: torch.Tensor) -> float:
+    """Sum of the predicted costs of the collapses that a change has made, by the (N,) cells that it has changed."""
+    before = mesh.tets[change.cell_parents[changed].long()].long()
+    after = change.parents[:, 0][change.mesh.tets[changed].long()].long()
     moved = before != after
-    pairs = torch.unique(torch.stack((before[moved], after[moved]), 1), dim=0)
+    collapses = torch.unique_consecutive(sort_keys((before[moved] << _ROW_BITS) | after[moved]))
+    pairs = torch.stack((collapses >> _ROW_BITS, collapses & ((1 << _ROW_BITS) - 1)), 1)
     kept = pairs[:, 1]
     edges = find_edges(mesh.topology, pairs)
     by_half_edge = torch.full(
