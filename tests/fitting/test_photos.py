@@ -52,7 +52,7 @@ def test_what_is_left_open_is_chosen_for_the_images(shiny: dtv.Capture) -> None:
     for few, rounds in ((600, 10), (9600, 64)):
         assert dataclasses.replace(chosen, iterations=few).strategy().rounds == rounds
     given = dataclasses.replace(chosen, exchange=dtv.fitting.Exchange(rounds=7))
-    assert (given.strategy().rounds, given.strategy().views) == (7, 36)
+    assert (given.strategy().rounds, given.strategy().pixels) == (7, 36)
     assert dataclasses.replace(chosen, start="grid").strategy().rounds is None
     opaque = dataclasses.replace(shiny, alphas=None)
     of_opaque = dtv.FitConfig().for_capture(opaque)

@@ -106,12 +106,12 @@ class Truth:
         camera = self.capture.cameras[view]
         return camera if type(camera) is Camera else self._view(view).camera
 
-    def rays(self, view: int) -> Rays:
-        """The rays of all pixels of a view."""
-        if self.cameras is not None:
-            camera = self.cameras(view)
-            return camera.with_pose(camera.world_to_camera.to(self.device)).rays()
-        return self._view(view).camera.rays()
+    def rays(self, view: int, pixels: torch.Tensor) -> Rays:
+        """The rays of some pixels of a view, (N,); these are counted row by row."""
+        if self.cameras is None:
+            return self._view(view).camera.rays_of(pixels)
+        camera = self.cameras(view)
+        return camera.with_pose(camera.world_to_camera.to(self.device)).rays_of(pixels)
 
     def _view(self, view: int) -> _View:
         if view in self._kept:

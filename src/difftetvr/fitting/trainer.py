@@ -263,7 +263,7 @@ class Trainer(AdaptiveRun):
         self.require_agreement()
 
     def _refine(self, strategy: Strategy) -> None:
-        judgement, mesh = self._judgement(self._judged_views), self.mesh
+        judgement, mesh = self._judgement(self._judged_views, self._judged_pixels), self.mesh
         unit = self.capture.density_unit
 
         def model(hats: HatChoice) -> ImageModel:
@@ -275,7 +275,7 @@ class Trainer(AdaptiveRun):
         judges = judgement.some()
         self._refine_by(strategy, situation, lambda: judges.error(self.mesh, self.field()))
 
-    def _judgement(self, views: int) -> Judgement:
+    def _judgement(self, views: int, pixels: float) -> Judgement:
         """What a refinement is judged on."""
         positions = self.config.refinement_views_at(self.iteration, views, len(self._train_views))
         judgement = Judgement.of(
@@ -284,6 +284,7 @@ class Trainer(AdaptiveRun):
             self.mesh,
             self.config.background_at(self.iteration),
             self.config.refinement_random(self.iteration),
+            pixels,
             self.config.batch,
             self.processes,
         )

@@ -125,18 +125,19 @@ class Rays:
             (M,) places in this bundle, counted through all of its shape, and the (M,) rays there, for each; and whether
             they are parallel.
         """
-        origins, directions = self.origins.reshape(-1, 3), self.directions.reshape(-1, 3)
-        groups = [torch.unique(part.detach(), dim=0, return_inverse=True)[1] for part in (origins, directions)]
+        parts = self.origins.reshape(-1, 3), self.directions.reshape(-1, 3)
+        groups = [torch.unique(part.detach(), dim=0, return_inverse=True)[1] for part in parts]
         counts = [int(group.max()) + 1 if group.numel() else 0 for group in groups]
         are_parallel = counts[1] < counts[0]
         group, count = groups[are_parallel], counts[are_parallel]
         all_places = torch.split(torch.argsort(group, stable=True), torch.bincount(group, minlength=count).tolist())
+        return [(place, self.some(place)) for place in all_places], are_parallel
 
-        def part(place: torch.Tensor) -> Rays:
-            ends = (e.reshape(-1)[place] if isinstance(e, torch.Tensor) else e for e in (self.near, self.far))
-            return Rays(origins[place], directions[place], *ends)
-
-        return [(place, part(place)) for place in all_places], are_parallel
+    def some(self, places: torch.Tensor) -> Rays:
+        """The rays at (M,) places, counted through all of the bundle's shape; (M,). Differentiable."""
+        origins, directions = (part.reshape(-1, 3)[places] for part in (self.origins, self.directions))
+        ends = (e.reshape(-1)[places] if isinstance(e, torch.Tensor) else e for e in (self.near, self.far))
+        return Rays(origins, directions, *ends)
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Rays:
         """The same rays on another device or in another precision; autograd sees them as a function of these.

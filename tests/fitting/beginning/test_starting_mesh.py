@@ -217,7 +217,7 @@ def test_refinement_predicts_nothing_where_nothing_would_change(room: dtv.Captur
     values = trainer.parameters.values(room.density_unit)
     torch.testing.assert_close(values[:, 3], torch.full_like(values[:, 3], 0.05))
     mesh = trainer.mesh
-    model = trainer._judgement(2).model(mesh, trainer.parameters.detached_field(), True)
+    model = trainer._judgement(2, 2.0).model(mesh, trainer.parameters.detached_field(), True)
     model = model.with_density_unit(room.density_unit)
     bisections = model.edges.gradient.abs().max()
     flips = flip_gains(find_flips(mesh, min_quality=0.0), values, model)

@@ -1,5 +1,6 @@
 """Pixels that refinements are judged on."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -110,6 +111,15 @@ def test_no_more_pixels_than_the_cells_need(
     assert round(wanted) < 24 * 20
     model = judged.together().model(mesh, field, True)
     assert model.error == pytest.approx(judged.error(mesh, field), rel=1e-4)
+
+
+@pytest.mark.parametrize(("limit", "each"), [(0.5, 80), (1.0, 160), (3.0, 480), (math.inf, 480)])
+def test_a_limit_is_of_all_views_together(
+    capture: Capture, scene: tuple[TetMesh, Field], monkeypatch: pytest.MonkeyPatch, limit: float, each: int
+) -> None:
+    monkeypatch.setattr(pixels, "_CROSSINGS", 1e6)
+    judged = Judgement.of(truth_of(capture), VIEWS, scene[0], BACKGROUND, np.random.default_rng(0), limit)
+    assert [part.count for part in judged.parts] == [each] * len(VIEWS)
 
 
 def test_masked_pixels_have_no_error(capture: Capture, scene: tuple[TetMesh, Field]) -> None:

@@ -17,6 +17,7 @@ from difftetvr.fitting.records.history import History, RefinementRecord
 from difftetvr.fitting.records.result import Picture, Progress
 from difftetvr.fitting.records.unread import Unread
 from difftetvr.fitting.refinement.strategy import (
+    USUAL_PIXELS,
     USUAL_VIEWS,
     EmptySpace,
     Model,
@@ -140,6 +141,12 @@ class AdaptiveRun:
     def _judged_views(self) -> int:
         """Training views that a refinement is judged on."""
         return (None if self.strategy is None else self.strategy.views) or USUAL_VIEWS
+
+    @property
+    def _judged_pixels(self) -> float:
+        """As many of their pixels, at most, as so many views have; strategies need not say."""
+        pixels: float | None = getattr(self.strategy, "pixels", None)
+        return pixels or USUAL_PIXELS
 
     def _moment(self) -> Moment:
         return Moment(self.iteration, self.config.steps, self._epoch, self.mesh.num_cells, self.budget)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Literal, TypeVar
 
@@ -12,7 +13,7 @@ _Own = TypeVar("_Own", bound="Exchange")
 
 _LEAST_ROUNDS, _ITERATIONS_PER_ROUND = 40, 60
 _ITERATIONS_TO_SETTLE = 20
-_LEAST_ROUNDS_ON_SURFACES, _ITERATIONS_PER_ROUND_ON_SURFACES, _VIEWS_ON_SURFACES = 10, 150, 36
+_LEAST_ROUNDS_ON_SURFACES, _ITERATIONS_PER_ROUND_ON_SURFACES, _PIXELS_ON_SURFACES = 10, 150, 36.0
 
 
 @dataclass(frozen=True)
@@ -33,8 +34,10 @@ class Exchange(OptionGroup):
     share: float = 0.08
     """Share of the cells that one round takes away."""
     views: int | None = None
-    """Random training views on which gains and losses are predicted; default: 12, for projections and for photographs
-    that begin with a visual hull 36."""
+    """Random training views on which gains and losses are predicted; default: 36."""
+    pixels: float | None = None
+    """Pixels of these that are looked at, at most, in units of a view's; default: 12, for projections and for
+    photographs that begin with a visual hull 36."""
     start: float = 0.6
     """New vertices start at this part of their best surplus over the interpolated values."""
     long: float = 0.6
@@ -55,6 +58,7 @@ class Exchange(OptionGroup):
             value = getattr(self, name)
             valid = value is None or 1 <= value <= LARGEST_COUNT
             self._require(valid, name, f"at least 1 and at most {LARGEST_COUNT}")
+        self._require(self.pixels is None or 0 < self.pixels < math.inf, "pixels", "greater than 0 and finite")
         self._require(0 <= self.share < 1, "share", "at least 0 and below 1")
         self._require(0 < self.initial <= 1, "initial", "greater than 0 and at most 1")
         for name in ("until", "start", "long", "min_quality"):
@@ -72,13 +76,13 @@ class Exchange(OptionGroup):
     def on_surfaces(self: _Own, iterations: int) -> _Own:
         """The same, where that is left open, with as many rounds as suffice where cells begin where they are needed.
 
-        Each of them looks at more views instead: what changes win on opaque surfaces differs from view to view.
+        Each of them looks at more pixels instead: what changes win on opaque surfaces differs from view to view.
 
         Args:
             iterations: Of the run.
         """
         rounds = max(_LEAST_ROUNDS_ON_SURFACES, iterations // _ITERATIONS_PER_ROUND_ON_SURFACES)
-        return replace(self, rounds=self.rounds or rounds, views=self.views or _VIEWS_ON_SURFACES)
+        return replace(self, rounds=self.rounds or rounds, pixels=self.pixels or _PIXELS_ON_SURFACES)
 
     def initial_cells(self, budget: int) -> int:
         """See `Strategy.initial_cells`."""

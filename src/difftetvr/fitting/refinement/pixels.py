@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial, reduce
@@ -36,7 +37,7 @@ class JudgedPixels:
         valid: (H, W) bool, those that count; None: all.
         background: Linear RGB behind the volume.
         views: Views that they are of.
-        make_rays: Makes the rays of the camera where the truth is.
+        make_rays: Makes the rays of some of the camera's pixels where the truth is.
     """
 
     rays: Camera | Rays
@@ -44,7 +45,7 @@ class JudgedPixels:
     valid: torch.Tensor | None
     background: Color
     views: int = 1
-    make_rays: Callable[[], Rays] | None = None
+    make_rays: Callable[[torch.Tensor], Rays] | None = None
 
     @staticmethod
     def of(truth: Truth, view: int, background: Color) -> JudgedPixels:
@@ -60,27 +61,27 @@ class JudgedPixels:
     @property
     def in_a_row(self) -> JudgedPixels:
         """The same as rays, in an order in which neighbours see neighbouring cells."""
-        if self.make_rays is None:
-            return self
-        rays = self.make_rays()
-        parts = [part.expand(*self.truth.shape).reshape(1, -1, 3) for part in (rays.origins, rays.directions)]
-        truth, valid = self.truth.reshape(1, -1, 3), None if self.valid is None else self.valid.reshape(1, -1)
-        pixels = replace(self, rays=Rays(*parts), truth=truth, valid=valid, make_rays=None)
-        order = image_order(tuple(self.truth.shape[:2]), truth.device)
-        return pixels if order is None else pixels._at(order.long())
+        return self if self.make_rays is None else self._at(torch.arange(self.count, device=self.truth.device))
 
     def spread(self, count: int, begin: float) -> JudgedPixels:
         """About as many as are asked for, in equal steps along their order; ``begin`` is in parts of a step."""
         if count >= self.count:
             return self
         steps = torch.arange(count, dtype=torch.float64, device=self.truth.device)
-        return self.in_a_row._at(((steps + begin) * (self.count / count)).long())
+        return self._at(((steps + begin) * (self.count / count)).long())
 
     def _at(self, places: torch.Tensor) -> JudgedPixels:
-        assert isinstance(self.rays, Rays)
-        rays = Rays(self.rays.origins[:, places], self.rays.directions[:, places])
-        valid = None if self.valid is None else self.valid[:, places]
-        return replace(self, rays=rays, truth=self.truth[:, places], valid=valid)
+        """Those at some places of their order, as a single row."""
+        if self.make_rays is not None:
+            order = image_order(tuple(self.truth.shape[:2]), self.truth.device)
+            places = places if order is None else order[places].long()
+            rays = self.make_rays(places)
+        else:
+            assert isinstance(self.rays, Rays)
+            rays = self.rays.some(places)
+        truth = self.truth.reshape(1, -1, 3)[:, places]
+        valid = None if self.valid is None else self.valid.reshape(1, -1)[:, places]
+        return replace(self, rays=_in_a_row(rays), truth=truth, valid=valid, make_rays=None)
 
     def model(
         self, mesh: TetMesh, field: Field | ScalarField, deterministic: bool, hats: HatChoice | None = None
@@ -129,6 +130,7 @@ class Judgement:
         mesh: TetMesh,
         background: Color,
         generator: np.random.Generator,
+        limit: float = math.inf,
         shares: int = 1,
         processes: Processes = ALONE,
     ) -> Judgement:
@@ -140,10 +142,14 @@ class Judgement:
             mesh: The mesh that is to be refined.
             background: Linear RGB behind the volume.
             generator: Makes the choice.
+            limit: Most pixels of all these views together, in units of a view's.
             shares: To how many shares the views are dealt out; each is summed up by itself.
             processes: Those that take the shares.
         """
-        wanted = max(1, round(_CROSSINGS * mesh.num_cells ** (2 / 3) / len(views)))
+        cameras = [truth.capture.cameras[view] for view in views]
+        sizes = [camera.width * camera.height for camera in cameras]
+        most = min(_CROSSINGS * mesh.num_cells ** (2 / 3), limit * sum(sizes) / len(sizes))
+        wanted = max(1, round(most / len(views)))
         chosen = [(view, generator.random()) for view in views]
         own = [
             [JudgedPixels.of(truth, view, background).spread(wanted, begin) for view, begin in share]
@@ -194,6 +200,12 @@ class Judgement:
 def _joined(parts: list[JudgedPixels]) -> JudgedPixels:
     parts = [part.in_a_row for part in parts]
     masks = [part.valid for part in parts if part.valid is not None]
-    origins, directions = (torch.cat([getattr(p.rays, name) for p in parts], 1) for name in ("origins", "directions"))
+    rays = _in_a_row(Rays.joined([part.rays for part in parts if isinstance(part.rays, Rays)]))
     truth, valid = torch.cat([part.truth for part in parts], 1), torch.cat(masks, 1) if masks else None
-    return JudgedPixels(Rays(origins, directions), truth, valid, parts[0].background, sum(part.views for part in parts))
+    return JudgedPixels(rays, truth, valid, parts[0].background, sum(part.views for part in parts))
+
+
+def _in_a_row(rays: Rays) -> Rays:
+    """(N,) rays as an image of one row."""
+    near, far = (end[None] if isinstance(end, torch.Tensor) else end for end in (rays.near, rays.far))
+    return Rays(rays.origins[None], rays.directions[None], near, far)

@@ -14,8 +14,9 @@ if TYPE_CHECKING:
     from difftetvr.mesh.tetmesh import TetMesh
     from difftetvr.rendering.gauss_newton import HatChoice, ImageModel
 
-USUAL_VIEWS = 12
-"""Views that a refinement is judged on where a strategy does not say how many."""
+USUAL_VIEWS, USUAL_PIXELS = 36, 12.0
+"""Views that a refinement is judged on where a strategy does not say how many, and as many pixels of them, at most, as
+so many views have: what one sees beside the others is worth more than all that it sees."""
 
 
 @dataclass(frozen=True)
@@ -116,7 +117,7 @@ class Strategy(Protocol):
 
     @property
     def views(self) -> int | None:
-        """Training views on which a refinement is judged; None: 12."""
+        """Training views on which a refinement is judged; None: 36."""
         ...
 
     def initial_cells(self, budget: int) -> int:

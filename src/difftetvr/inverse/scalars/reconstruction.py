@@ -250,6 +250,7 @@ class ScalarReconstruction(AdaptiveRun):
             mesh,
             BLACK,
             self.config.refinement_random(self.iteration),
+            self._judged_pixels,
         ).together()
 
         def model(hats: HatChoice) -> ImageModel:

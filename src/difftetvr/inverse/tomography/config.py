@@ -32,7 +32,7 @@ _START = 0.1
 mend the same residual."""
 
 _LEAST_CELLS, _MOST_CELLS, _PIXELS_PER_CELL = 20_000, 300_000, 40
-_FEWEST_VIEWS, _MOST_VIEWS, _JUDGED_VIEWS = 6, 10, 36
+_FEWEST_VIEWS, _MOST_VIEWS, _JUDGED_PIXELS = 6, 10, 36.0
 
 _RANGES = {
     "cells": (1, MAX_CELLS),
@@ -108,9 +108,9 @@ class TomographyConfig(Schedule):
     """Seconds between checkpoints."""
     motion: Motion = field(default_factory=lambda: Motion(rate=0.8, final_rate=0.04, barrier=0.01))
     """How vertices move."""
-    exchange: Exchange = field(default_factory=lambda: Exchange(start=_START, views=_JUDGED_VIEWS))
+    exchange: Exchange = field(default_factory=lambda: Exchange(start=_START, pixels=_JUDGED_PIXELS))
     """Options of --refine exchange."""
-    grow: Grow = field(default_factory=lambda: Grow(start=_START, views=_JUDGED_VIEWS))
+    grow: Grow = field(default_factory=lambda: Grow(start=_START, pixels=_JUDGED_PIXELS))
     """Options of --refine grow."""
 
     def __post_init__(self) -> None:

@@ -229,7 +229,8 @@ class Reconstruction(AdaptiveRun):
         if self.strategy is None or not self.strategy.is_due(self._moment()):
             return
         mesh, densities = self.mesh, self.densities
-        parts = self._pixels_to_judge(self._judged_views, Judgement.wanted(mesh))
+        most = round(self._judged_pixels * self.measurements.all_pixels)
+        parts = self._pixels_to_judge(self._judged_views, min(Judgement.wanted(mesh), most))
         judgement = Judgement(parts, self.config.likelihood, self.config.deterministic)
 
         def model(hats: HatChoice) -> ImageModel:

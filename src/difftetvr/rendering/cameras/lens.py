@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import torch
 
@@ -14,10 +13,6 @@ from difftetvr.rendering.cameras.intrinsics import FieldOfView, Intrinsics, fiel
 from difftetvr.rendering.cameras.lenses.distortion import Distortion
 from difftetvr.rendering.cameras.lenses.models import LENS_MODELS
 from difftetvr.rendering.cameras.pinhole import Camera
-from difftetvr.rendering.cameras.rigid import pencil
-
-if TYPE_CHECKING:
-    from difftetvr.rendering.rays import Rays
 
 
 @dataclass(frozen=True)
@@ -89,13 +84,10 @@ class LensCamera(Camera):
         view = self._field_of_view()
         return torch.where(view.known[..., None], view.directions, torch.nan)
 
-    def rays(self) -> Rays:
-        """The rays of all pixels in world space, (H, W); of pixels that the lens cannot have made nothing is seen."""
-        from difftetvr.rendering.rays import Rays  # late: it needs cameras' errors, not cameras
-
+    def _sight(self) -> tuple[torch.Tensor, torch.Tensor | float]:
+        """As of all cameras; of pixels that the lens cannot have made nothing is seen."""
         view = self._field_of_view()
-        origins, directions = pencil(self.world_to_camera, view.directions)
-        return Rays(origins, directions, 0.0, torch.where(view.known, math.inf, 0.0).to(directions.device))
+        return view.directions, torch.where(view.known, math.inf, 0.0).to(view.directions.device)
 
     def _field_of_view(self) -> FieldOfView:
         if self.intrinsics is None and not self.coefficients.requires_grad:

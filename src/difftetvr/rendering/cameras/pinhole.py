@@ -216,7 +216,29 @@ class Camera:
         """The rays of all pixels in world space, (H, W); differentiable in extrinsics and intrinsics."""
         from difftetvr.rendering.rays import Rays  # late: it needs cameras' errors, not cameras
 
-        return Rays(*pencil(self.world_to_camera, self.ray_directions()))
+        directions, far = self._sight()
+        return Rays(*pencil(self.world_to_camera, directions), 0.0, far)
+
+    def rays_of(self, pixels: torch.Tensor) -> Rays:
+        """The rays of some pixels, likewise: for views of which only these are looked at.
+
+        Args:
+            pixels: (N,) int64, row * W + column.
+
+        Returns:
+            (N,) rays.
+        """
+        from difftetvr.rendering.rays import Rays  # late, as above
+
+        directions, far = self._sight()
+        pixels = pixels.to(directions.device)
+        directions = directions.reshape(-1, 3).index_select(0, pixels)
+        far = far.reshape(-1).index_select(0, pixels) if isinstance(far, torch.Tensor) else far
+        return Rays(*pencil(self.world_to_camera, directions), 0.0, far)
+
+    def _sight(self) -> tuple[torch.Tensor, torch.Tensor | float]:
+        """(H, W, 3) directions of the pixels' rays in camera space, and how far each of them goes."""
+        return self.ray_directions(), math.inf
 
     def kernel_rays(self, backend: Backend) -> ImageRays:
         """The camera's rays for kernels of a back end."""
