@@ -51,15 +51,17 @@ class HatChoice:
             return self
         return replace(self, face_steps=torch.cat((self.face_steps[:, :3], unit * self.face_steps[:, 3:]), 1))
 
-    def space(self, view: PreparedView, mesh: TetMesh, floats: int) -> HatSpace:
-        """The hats of a mesh in a view.
 
-        Args:
-            view: The view.
-            mesh: The mesh.
-            floats: What is known of a hat.
-        """
-        topology, steps = mesh.topology, self.face_steps
-        edges = Chosen(self.edges, topology.edges.shape[0])
-        faces = Chosen(None if steps is None else (steps != 0).any(1), topology.faces.shape[0])
-        return HatSpace(view.task.backend, mesh, view.upload.order, edges, faces, floats, steps is not None)
+def space_of(hats: HatChoice, view: PreparedView, mesh: TetMesh, floats: int) -> HatSpace:
+    """The hats of a mesh in a view.
+
+    Args:
+        hats: Which ones.
+        view: The view.
+        mesh: The mesh.
+        floats: What is known of a hat.
+    """
+    topology, steps = mesh.topology, hats.face_steps
+    edges = Chosen(hats.edges, topology.edges.shape[0])
+    faces = Chosen(None if steps is None else (steps != 0).any(1), topology.faces.shape[0])
+    return HatSpace(view.task.backend, mesh, view.upload.order, edges, faces, floats, steps is not None)

@@ -12,7 +12,7 @@ from difftetvr.memory import tried_twice
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.recording import eager
 from difftetvr.rendering.api import as_background
-from difftetvr.rendering.gauss_newton.choice import HatChoice
+from difftetvr.rendering.gauss_newton.choice import HatChoice, space_of
 from difftetvr.rendering.gauss_newton.models import HatDerivatives, ImageModel, StepDerivatives
 from difftetvr.rendering.kernels.composition import Composition
 from difftetvr.rendering.kernels.forward import render_forward
@@ -115,7 +115,7 @@ class _LightModels:
             in_order: Whether sums have a certain order.
         """
         backend, face_steps = self.view.task.backend, self.hats.face_steps
-        space = self.hats.space(self.view, mesh, self.floats)
+        space = space_of(self.hats, self.view, mesh, self.floats)
         steps = None if face_steps is None else backend.floats(self.steps_of(space.faces.values(face_steps)))
         color, gradient = (backend.floats(part) for part in image)
         return space.tensors(self.gather(tracer, HatImage(color, gradient, steps), space, in_order))

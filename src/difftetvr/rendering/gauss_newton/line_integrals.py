@@ -8,7 +8,7 @@ from difftetvr.errors import DiffTetError
 from difftetvr.memory import tried_twice
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.recording import eager
-from difftetvr.rendering.gauss_newton.choice import HatChoice
+from difftetvr.rendering.gauss_newton.choice import HatChoice, space_of
 from difftetvr.rendering.gauss_newton.models import HatDerivatives, ImageModel, StepDerivatives
 from difftetvr.rendering.kernels.hats.absorption import RECORD, IntegralErrors, absorption_records
 from difftetvr.rendering.preparation import ViewOptions, prepare_view
@@ -59,7 +59,7 @@ def model_line_integrals(
     backend = view.task.backend
     tracer = view.tracer(view.ends)
     with backend.exclusive(deterministic):
-        space = hats.space(view, mesh, RECORD)
+        space = space_of(hats, view, mesh, RECORD)
         density_steps = space.faces.values(hats.face_steps)[:, 3].to(mesh.vertices) * view.unit
         slopes, curvatures, steps = (backend.floats(part.reshape(-1)) for part in (*errors, density_steps))
         records = absorption_records(tracer, IntegralErrors(slopes, curvatures, steps), space, deterministic)
