@@ -29,15 +29,19 @@ _ALLOCATION = re.compile(
     re.IGNORECASE,
 )
 
-# Parameters of glibc's mallopt: values that keep what is freed, and its defaults.
-_TRIM_THRESHOLD, _TOP_PAD, _MMAP_MAX = -1, -2, -4
+# Parameters of glibc's mallopt: values that keep what is freed, and those that a process comes to by itself. Whoever
+# sets one keeps its thresholds from growing with what is freed, so they are left where they had grown to at most.
+_TRIM_THRESHOLD, _TOP_PAD, _MMAP_THRESHOLD, _MMAP_MAX = -1, -2, -3, -4
 _KEEPING = {_TRIM_THRESHOLD: -1, _TOP_PAD: 1 << 26, _MMAP_MAX: 0}
-_GIVING_BACK = {_TRIM_THRESHOLD: 1 << 17, _TOP_PAD: 1 << 17, _MMAP_MAX: 1 << 16}
+_GIVING_BACK = {_TRIM_THRESHOLD: 1 << 26, _TOP_PAD: 1 << 17, _MMAP_THRESHOLD: 1 << 25, _MMAP_MAX: 1 << 16}
 
 
 @contextmanager
 def kept() -> Iterator[None]:
-    """Has glibc keep what is freed, for as long as large arrays come and go; then it goes back to the system."""
+    """Has glibc keep what is freed, for as long as large arrays come and go; then it goes back to the system.
+
+    Of two that are in each other, or in two threads, the first that ends is the end of both.
+    """
     libc = _glibc()
     if libc is None:
         yield

@@ -229,7 +229,7 @@ def test_checkpoint_of_another_version(begun, tmp_path, monkeypatch):
     dumps = json.dumps
     monkeypatch.setattr(json, "dumps", lambda state: dumps(state | {"version": 1}))
     begun.checkpoint().save(path)
-    with pytest.raises(FitError, match="has version 1, this program reads version 5; start anew"):
+    with pytest.raises(FitError, match="has version 1, this program reads version 6; start anew"):
         Checkpoint.load(path)
 
 

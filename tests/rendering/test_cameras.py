@@ -257,3 +257,25 @@ def test_what_is_no_camera_is_refused(camera: object) -> None:
     mesh, field = scene()
     with pytest.raises(DiffTetError, match=r"camera is .*; pass a difftetvr\.Camera, a list of cameras, or"):
         render(mesh, field, camera)  # type: ignore[call-overload]
+
+
+@pytest.mark.parametrize("kind", ["pinhole", "lens"])
+def test_rays_of_some_pixels_are_those_of_all(kind: str) -> None:
+    pose = POSE.clone().requires_grad_()
+    camera = Camera(pose, *INTRINSICS, 7, 6)
+    if kind == "lens":
+        # So strong that its formulas fold back: what lies at the rim it cannot have made.
+        camera = LensCamera(pose, *INTRINSICS, 7, 6, model="opencv", coefficients=torch.tensor([-2.0, 0.0]))
+    pixels = torch.tensor([0, 23, 23, 41, 8])
+    found, expected = camera.rays_of(pixels), camera.rays().some(pixels)
+    for name in ("origins", "directions"):
+        assert torch.equal(getattr(found, name), getattr(expected, name))
+    assert torch.equal(found.ends[1], expected.ends[1]) and bool((found.ends[1] == 0).any()) == (kind == "lens")
+    gradients = [torch.autograd.grad((r.directions * r.origins).sum(), pose)[0] for r in (found, expected)]
+    torch.testing.assert_close(*gradients)
+    for wrong in ([0, 1], torch.tensor([0.0]), torch.tensor([[0]])):
+        with pytest.raises(CameraError, match=r"The pixels are .*; pass integers of shape \(N,\)"):
+            camera.rays_of(wrong)  # type: ignore[arg-type]
+    for wrong in (torch.tensor([3, 42]), torch.tensor([-1])):
+        with pytest.raises(CameraError, match=r"Pixels go from -?\d+ to -?\d+; this image has 0 to 41\."):
+            camera.rays_of(wrong)

@@ -275,7 +275,7 @@ def test_edges_that_are_asked_for_have_the_models_of_all(share):
 def test_what_is_refused():
     mesh, field, truth = random_scene()
     per_cell = dtv.Field(torch.rand(mesh.num_cells, 3), torch.rand(mesh.num_cells))
-    with pytest.raises(DiffTetError, match=r"face_steps has shape \(3, 4\); this mesh takes \(\d+, 4\)\."):
+    with pytest.raises(DiffTetError, match=r"face_steps is .*; pass floats of shape \(\d+, 4\), one step a face\."):
         model_image(mesh, field, camera_at(OUTSIDE), truth, hats=HatChoice(face_steps=torch.zeros(3, 4)))
     with pytest.raises(DiffTetError, match=r"edges is .*; pass a bool tensor of shape \(\d+,\), one for each edge\."):
         model_image(mesh, field, camera_at(OUTSIDE), truth, hats=HatChoice(edges=torch.arange(3)))

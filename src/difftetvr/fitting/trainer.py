@@ -266,9 +266,10 @@ class Trainer(AdaptiveRun):
         judgement, mesh = self._judgement(self._judged_views, self._judged_pixels), self.mesh
         unit = self.capture.density_unit
 
-        def model(hats: HatChoice) -> ImageModel:
+        def model(hats: HatChoice | None = None) -> ImageModel:
             field, deterministic = self.field(), self.config.deterministic
-            return judgement.model(mesh, field, deterministic, hats.from_density_unit(unit)).with_density_unit(unit)
+            hats = (hats or HatChoice()).from_density_unit(unit)
+            return judgement.model(mesh, field, deterministic, hats).with_density_unit(unit)
 
         values = self.parameters.values(unit)
         situation = Situation(mesh, values, self._moment(), model, self._color_gradients, self._free_space)

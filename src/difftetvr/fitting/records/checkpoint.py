@@ -29,7 +29,7 @@ from difftetvr.fitting.records.history import History
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.rendering.cameras.lens import LensCamera
 
-_VERSION = 5
+_VERSION = 6
 _HISTORY = ("history.loss", "history.psnr")
 
 

@@ -16,8 +16,8 @@ from difftetvr.fitting.records.checkpoint import Checkpoint
 from difftetvr.fitting.records.history import History, RefinementRecord
 from difftetvr.fitting.records.result import Picture, Progress
 from difftetvr.fitting.records.unread import Unread
+from difftetvr.fitting.refinement.exchange import Exchange
 from difftetvr.fitting.refinement.strategy import (
-    USUAL_PIXELS,
     USUAL_VIEWS,
     EmptySpace,
     Model,
@@ -33,6 +33,7 @@ from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.rendering import ScalarField
 
 _GLANCE_VIEWS = 4
+_USUAL_PIXELS = 12.0  # a third of those views: what a view sees beside the others is worth more than all that it sees
 _POSITIONS = "positions."  # prefix of the positions' state in a checkpoint
 
 
@@ -144,9 +145,8 @@ class AdaptiveRun:
 
     @property
     def _judged_pixels(self) -> float:
-        """As many of their pixels, at most, as so many views have; strategies need not say."""
-        pixels: float | None = getattr(self.strategy, "pixels", None)
-        return pixels or USUAL_PIXELS
+        """As many of their pixels, at most, as so many views have; other strategies than these get all."""
+        return self.strategy.pixels or _USUAL_PIXELS if isinstance(self.strategy, Exchange) else math.inf
 
     def _moment(self) -> Moment:
         return Moment(self.iteration, self.config.steps, self._epoch, self.mesh.num_cells, self.budget)

@@ -70,6 +70,8 @@ def bisection_gains(
 ) -> BisectionGains:
     """Predicts what bisecting each edge would win; those that are no candidates win nothing.
 
+    Steps are damped by the mean of the candidates' second derivatives.
+
     Args:
         mesh: The mesh.
         values: (V, 4) parameters.

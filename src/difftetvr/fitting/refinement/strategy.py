@@ -14,9 +14,8 @@ if TYPE_CHECKING:
     from difftetvr.mesh.tetmesh import TetMesh
     from difftetvr.rendering.gauss_newton import HatChoice, ImageModel
 
-USUAL_VIEWS, USUAL_PIXELS = 36, 12.0
-"""Views that a refinement is judged on where a strategy does not say how many, and as many pixels of them, at most, as
-so many views have: what one sees beside the others is worth more than all that it sees."""
+USUAL_VIEWS = 36
+"""Views that a refinement is judged on where a strategy does not say how many."""
 
 
 @dataclass(frozen=True)
@@ -46,8 +45,8 @@ class Moment:
 class Model(Protocol):
     """The quadratic models of an error, made when they are asked for; see `Situation`."""
 
-    def __call__(self, hats: HatChoice) -> ImageModel:
-        """The models of some hats."""
+    def __call__(self, hats: HatChoice | None = None) -> ImageModel:
+        """The models of some hats; None: of all, but for faces in scans."""
         ...
 
 
@@ -68,7 +67,7 @@ class Situation:
         values: (V, 4) parameters of its vertices: linear RGB in [0, 1], and density in units of the capture's.
         moment: Where the run stands.
         model: The mean over some random training views of the squared error and its quadratic models, in the units of
-            ``values``. It takes which hats are of interest, with steps in these units.
+            ``values``. It takes which hats are of interest, with steps in these units; None: all.
         color_gradients: The sum over all training views of the absolute derivatives of the loss with respect to
             each vertex's colour, (V,).
         free_space: Where densities stay 0.

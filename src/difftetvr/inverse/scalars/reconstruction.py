@@ -253,7 +253,7 @@ class ScalarReconstruction(AdaptiveRun):
             self._judged_pixels,
         ).together()
 
-        def model(hats: HatChoice) -> ImageModel:
+        def model(hats: HatChoice | None = None) -> ImageModel:
             return judgement.model(mesh, self.field(), self.config.deterministic, hats)
 
         situation, judges = self._situation(self.scalars.values, model, reach=_REACH), judgement.some()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -41,15 +41,18 @@ class Judgement:
         """A few of the views: enough to see what became of the error."""
         return Judgement(self.parts[: max(1, len(self.parts) // 4)], self.likelihood, self.deterministic)
 
-    def model(self, mesh: TetMesh, density: torch.Tensor, unit: float, hats: HatChoice) -> ImageModel:
+    def model(self, mesh: TetMesh, density: torch.Tensor, unit: float, hats: HatChoice | None = None) -> ImageModel:
         """Quadratic models of the mean loss.
 
         Args:
             mesh: The mesh.
             density: (V,) densities per unit of length.
             unit: What densities are counted in, in the models and steps.
-            hats: Edges and steps of faces that are looked at.
+            hats: Edges and steps of faces that are looked at; None: all edges. Without steps nothing is known of faces.
         """
+        hats = hats or HatChoice()
+        if hats.face_steps is None:
+            hats = replace(hats, face_steps=density.new_zeros(mesh.topology.faces.shape[0], 4))
         hats = hats.from_density_unit(unit)
         total: ImageModel | None = None
         share = 1.0 / self._count

@@ -229,11 +229,11 @@ class Reconstruction(AdaptiveRun):
         if self.strategy is None or not self.strategy.is_due(self._moment()):
             return
         mesh, densities = self.mesh, self.densities
-        most = round(self._judged_pixels * self.measurements.all_pixels)
-        parts = self._pixels_to_judge(self._judged_views, min(Judgement.wanted(mesh), most))
+        most = self._judged_pixels * self.measurements.all_pixels
+        parts = self._pixels_to_judge(self._judged_views, round(min(Judgement.wanted(mesh), most)))
         judgement = Judgement(parts, self.config.likelihood, self.config.deterministic)
 
-        def model(hats: HatChoice) -> ImageModel:
+        def model(hats: HatChoice | None = None) -> ImageModel:
             return judgement.model(mesh, densities.detached(), densities.unit, hats)
 
         situation, judges = self._situation(densities.values, model, self._outside), judgement.some()

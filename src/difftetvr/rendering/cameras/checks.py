@@ -38,6 +38,17 @@ def pixels(name: str, value: object) -> int:
     return count
 
 
+def require_places(places: Any, count: int) -> None:
+    """Checks that these are (N,) integers from 0 to below ``count``; of those on a GPU all but how large they are."""
+    is_list = isinstance(places, torch.Tensor) and places.ndim == 1 and places.dtype in (torch.int32, torch.int64)
+    if not is_list:
+        raise CameraError(f"The pixels are {shown(places)}; pass integers of shape (N,), row * width + column.")
+    if places.device.type == "cpu" and places.numel() and not 0 <= int(places.min()) <= int(places.max()) < count:
+        raise CameraError(
+            f"Pixels go from {int(places.min())} to {int(places.max())}; this image has 0 to {count - 1}."
+        )
+
+
 def take_size(camera: Any) -> None:
     """Check ``width`` and ``height`` of a frozen camera, and keep them as integers.
 

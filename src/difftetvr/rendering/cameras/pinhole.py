@@ -11,7 +11,7 @@ import torch
 
 from difftetvr.errors import CameraError, shown
 from difftetvr.inputs import as_reals, handed_over
-from difftetvr.rendering.cameras.checks import number, pixels, take_pose, take_size
+from difftetvr.rendering.cameras.checks import number, pixels, require_places, take_pose, take_size
 from difftetvr.rendering.cameras.lenses.distortion import Distortion, through_plane
 from difftetvr.rendering.cameras.rigid import pencil, transformed
 
@@ -227,9 +227,13 @@ class Camera:
 
         Returns:
             (N,) rays.
+
+        Raises:
+            CameraError: These are no pixels of the image; looked over on the CPU alone.
         """
         from difftetvr.rendering.rays import Rays  # late, as above
 
+        require_places(pixels, self.width * self.height)
         directions, far = self._sight()
         pixels = pixels.to(directions.device)
         directions = directions.reshape(-1, 3).index_select(0, pixels)

@@ -38,8 +38,13 @@ class HatChoice:
             isinstance(mask, torch.Tensor) and mask.dtype == torch.bool and mask.shape == (edges,)
         ):
             raise DiffTetError(f"edges is {shown(mask)}; pass a bool tensor of shape {(edges,)}, one for each edge.")
-        if steps is not None and steps.shape != (faces, 4):
-            raise DiffTetError(f"face_steps has shape {tuple(steps.shape)}; this mesh takes {(faces, 4)}.")
+        if steps is not None and not (
+            isinstance(steps, torch.Tensor) and steps.is_floating_point() and steps.shape == (faces, 4)
+        ):
+            raise DiffTetError(f"face_steps is {shown(steps)}; pass floats of shape {(faces, 4)}, one step a face.")
+        for name, part in (("edges", mask), ("face_steps", steps)):
+            if part is not None and part.device != mesh.vertices.device:
+                raise DiffTetError(f"{name} is on '{part.device}', the mesh on '{mesh.vertices.device}'; move one.")
 
     def from_density_unit(self, unit: float) -> HatChoice:
         """The same for a field's own densities, of steps whose densities are counted in a unit.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 
 from difftetvr.errors import DiffTetError
+from difftetvr.inputs import require_type
 from difftetvr.memory import tried_twice
 from difftetvr.mesh import Field, TetMesh
 from difftetvr.recording import eager
@@ -53,6 +54,7 @@ def model_line_integrals(
             raise DiffTetError(f"A derivative has shape {tuple(tensor.shape)}; this view takes {tuple(view.shape)}.")
     if 0 in view.shape:
         raise DiffTetError(f"The view has the shape {view.shape}, so it says nothing; pass one of a ray at least.")
+    require_type(hats, HatChoice, "hats", "pass a HatChoice", DiffTetError)
     if hats.face_steps is None:
         raise DiffTetError("No steps of faces are passed, and line integrals have no models of all of them; pass some.")
     hats.require_fit(mesh)
