@@ -139,7 +139,7 @@ def optimise(
         FitError: The checkpoint cannot be written, or the loss is not finite.
         KeyboardInterrupt: The run was interrupted; the checkpoint is saved.
     """
-    with one_torch_thread(), memory.kept():
+    with optimising():
         iterate(trainer, path, on_progress)
         tested: list[int] = trainer.capture.test_indices.tolist()
         trainer.align(tested)
@@ -225,6 +225,13 @@ def iterate(trainer: Run, path: Path | None, on_progress: Callable[[Any], None] 
             # Once one process has left, who has started them may kill the others.
             processes.any(stopped)
             raise KeyboardInterrupt
+
+
+@contextmanager
+def optimising() -> Iterator[None]:
+    """What every loop that optimises runs in: memory that is freed is kept, and the renderer has the cores."""
+    with one_torch_thread(), memory.kept():
+        yield
 
 
 @contextmanager

@@ -54,7 +54,7 @@ def exchange_cells(situation: Situation, target: int, options: Exchange) -> Refi
         exchange.flip(flips, model, target, options)
     if options.share:
         exchange.collapse(model, options)
-    exchange.bisect(target, options)
+    exchange.bisect(target)
     return exchange.refinement()
 
 
@@ -120,17 +120,17 @@ class _Round:
         self._carry_edges(change, changed)
         self._apply(change)
 
-    def bisect(self, target: int, options: Exchange) -> None:
+    def bisect(self, target: int) -> None:
         """Bisect the most promising edges until there are as many cells as wanted."""
         topology = self.mesh.topology
         ends = topology.edges.long()
         positions = self.mesh.vertices
         length = torch.linalg.vector_norm(positions[ends[:, 1]] - positions[ends[:, 0]], dim=1)
         gain = self.gains.gain
-        allowed = long_edges(self.mesh, options.long) & (gain > 0)
         budget = max(0, target - self.mesh.num_cells)
-        # Gain per new cell; long edges come first, which keeps shapes good.
-        chosen = independent_edges(self.mesh, gain / cells_per_edge(topology) * length, allowed, budget)
+        # Gain per new cell; long edges come first, which keeps shapes good. What wins anything may be bisected: gains
+        # are those of edges that are long among their cells, and known only while these are the same.
+        chosen = independent_edges(self.mesh, gain / cells_per_edge(topology) * length, gain > 0, budget)
         change = bisect_edges(self.mesh, chosen)
         done = find_edges(topology, change.parents[change.is_new].long())
         self.surplus = torch.zeros_like(change.carry(self.values))

@@ -10,11 +10,10 @@ from pathlib import Path
 from types import NoneType
 from typing import Any
 
-from difftetvr import memory
 from difftetvr.capture.capture import Capture
 from difftetvr.errors import FitError
 from difftetvr.fitting.beginning.starting_mesh import starting_mesh
-from difftetvr.fitting.loop import iterate, one_torch_thread
+from difftetvr.fitting.loop import iterate, optimising
 from difftetvr.fitting.records.checkpoint import Checkpoint, alone_with
 from difftetvr.fitting.records.evaluation import Evaluation
 from difftetvr.fitting.records.history import History
@@ -164,7 +163,7 @@ def optimise(
         path: Checkpoint to write.
         on_progress: Called after every iteration.
     """
-    with one_torch_thread(), memory.kept():
+    with optimising():
         iterate(run, path, on_progress)
         evaluation = run.evaluate(run.capture.test_indices.tolist())
     return ScalarResult(run.mesh, run.field(), evaluation, run.history, run.config)

@@ -10,10 +10,9 @@ from pathlib import Path
 from types import NoneType
 from typing import Any
 
-from difftetvr import memory
 from difftetvr.capture.projections.projection_capture import ProjectionCapture
 from difftetvr.errors import FitError
-from difftetvr.fitting.loop import iterate, one_torch_thread
+from difftetvr.fitting.loop import iterate, optimising
 from difftetvr.fitting.records.checkpoint import Checkpoint, alone_with
 from difftetvr.fitting.records.history import History
 from difftetvr.fitting.records.result import Progress
@@ -130,7 +129,7 @@ def optimise(
         on_progress: Called after every iteration.
         on_solve: Called after every step of the solver.
     """
-    with one_torch_thread(), memory.kept():
+    with optimising():
         iterate(run, path, on_progress)
         if run.config.solve_steps:
             run.solve(on_solve)

@@ -15,11 +15,10 @@ from typing import Any
 
 import torch
 
-from difftetvr import memory
 from difftetvr.capture.capture import Capture
 from difftetvr.capture.truth import BLACK, WHITE, Truth
 from difftetvr.errors import CaptureError, FitError, MeshError, shown
-from difftetvr.fitting.loop import iterate, one_torch_thread
+from difftetvr.fitting.loop import iterate, optimising
 from difftetvr.fitting.metrics import psnr_of_mse
 from difftetvr.fitting.processes import ALONE
 from difftetvr.fitting.records.checkpoint import Checkpoint, alone_with, describe_capture
@@ -141,7 +140,7 @@ def fit_transfer(
         if path is not None and resume and path.exists():
             run.resume(path)
         run.require_something_seen()
-        with one_torch_thread(), memory.kept():
+        with optimising():
             iterate(run, path, on_progress)
         return run.result()
 

@@ -8,8 +8,7 @@ import torch
 
 from difftetvr.errors import DiffTetError, shown
 from difftetvr.mesh import TetMesh
-from difftetvr.rendering.kernels.hats.space import HatSpace
-from difftetvr.rendering.kernels.hats.tables import Chosen
+from difftetvr.rendering.kernels.hats.space import Chosen, HatSpace
 from difftetvr.rendering.preparation import PreparedView
 
 

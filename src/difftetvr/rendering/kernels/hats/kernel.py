@@ -122,7 +122,7 @@ def gathered_records(kernel: Any, tracer: Tracer, asked: Any, space: HatSpace, i
     deal, pairs = Deal.of(tracer, sum(sizes), in_order), zip(sizes, space.widths, strict=True)
     copies = [Copies.of(view.backend, deal.copies, size, width) for size, width in pairs]
     buffers = _Buffers(sizes, copies, space.width)
-    tables = HatTables.of(view, space.mesh, space.order, space.edges, space.faces)
+    tables = HatTables.of(space)
     with view.backend.on_threads(deal.threads):
         records: HatRecords = replayed(_records, kernel, tracer, tables, asked, deal, buffers)
     return records

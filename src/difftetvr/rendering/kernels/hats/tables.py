@@ -3,74 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import drjit as dr
 import torch
 
-from difftetvr.mesh import TetMesh
-from difftetvr.mesh.arrays import chunks, constant, true_indices
+from difftetvr.mesh.arrays import chunks, constant
 from difftetvr.mesh.topology.incidence import cell_edges, cell_faces
 from difftetvr.mesh.topology.topology import LOCAL_EDGE_OF, LOCAL_EDGES, Topology
+from difftetvr.rendering.kernels.hats.space import HatSpace
 from difftetvr.rendering.search.memory_order import MemoryOrder
-from difftetvr.rendering.traversal.crossing import View
-
-_SPARE = 16
-"""Records that take what is added for hats which nobody asks for: threads of a CPU would guess wrong half of the time
-whether they have to add, and additions to one record would wait for each other."""
-
-
-@dataclass(frozen=True)
-class Chosen:
-    """The edges or faces that have records.
-
-    Attributes:
-        mask: (N,) bool, those that are asked for; None: all.
-        count: Number N of all.
-    """
-
-    mask: torch.Tensor | None
-    count: int
-
-    @cached_property
-    def rows(self) -> torch.Tensor:
-        """(M,) int64 which of all have records, in the order of these."""
-        assert self.mask is not None
-        return true_indices(self.mask)
-
-    @property
-    def asked(self) -> int:
-        """Number M of those that are asked for."""
-        return self.count if self.mask is None else self.rows.shape[0]
-
-    @property
-    def records(self) -> int:
-        """Number of their records, with those that are spare."""
-        return self.count if self.mask is None else self.asked + _SPARE
-
-    def numbered(self, table: torch.Tensor) -> torch.Tensor:
-        """A table of indices with numbers of records instead."""
-        if self.mask is None:
-            return table
-        spare = torch.arange(self.count, dtype=torch.int32, device=table.device).remainder_(_SPARE).add_(self.asked)
-        places = self.mask.cumsum(0, dtype=torch.int32).sub_(1)
-        numbers = torch.where(self.mask, places, spare)
-        return numbers.index_select(0, table.view(-1)).view_as(table)
-
-    def values(self, values: torch.Tensor) -> torch.Tensor:
-        """(N, ...) values of all, as those of the records; 0 for spare ones."""
-        if self.mask is None:
-            return values
-        chosen = values.index_select(0, self.rows)
-        return torch.cat((chosen, chosen.new_zeros(_SPARE, *chosen.shape[1:])))
-
-    def spread(self, records: torch.Tensor) -> torch.Tensor:
-        """(N, width) what is known of all, from their records; 0 where nothing is."""
-        if self.mask is None:
-            return records[: self.count]
-        known = records.new_zeros(self.count, records.shape[1])
-        return known.index_copy_(0, self.rows, records[: self.asked])
 
 
 @dataclass
@@ -90,11 +32,11 @@ class HatTables:
     asked_faces: Any | None
 
     @staticmethod
-    def of(view: View, mesh: TetMesh, order: MemoryOrder, edges: Chosen, faces: Chosen) -> HatTables:
-        """Upload the tables of a mesh in an order; but for who is asked for, built once for a topology."""
-        backend = view.backend
-        tables = order.topology.cached("render.hat_tables", lambda: _ranked_tables(mesh.topology, order))
-        both = edges, faces
+    def of(space: HatSpace) -> HatTables:
+        """Upload the tables of a mesh in its order; but for who is asked for, built once for a topology."""
+        backend, order, topology = space.backend, space.order, space.mesh.topology
+        tables = order.topology.cached("render.hat_tables", lambda: _ranked_tables(topology, order))
+        both = space.edges, space.faces
         arrays = (backend.uints(chosen.numbered(table)) for chosen, table in zip(both, tables, strict=True))
         # Atomic additions of a GPU to a few records wait for each other; threads that add nothing cost it nothing.
         waits = backend.name != "llvm"
