@@ -316,7 +316,7 @@ def test_models_of_line_integrals_predict_what_densities_do(scale):
 
     flips = find_flips(mesh)
     values = torch.nn.functional.pad(density[:, None], (3, 0))
-    hats = HatChoice(face_steps=face_steps(flips, values))
+    hats = HatChoice(face_steps=face_steps(flips, flips.surplus(values)))
     errors = weights * (integrals(mesh, density) - measured), weights
     model = model_line_integrals(mesh, density, camera, errors, hats)
     step = torch.tensor([[0.0, 0.0, 0.0, 0.3 * unit]], dtype=torch.float64)
@@ -332,7 +332,7 @@ def test_models_of_line_integrals_predict_what_densities_do(scale):
         moved[change.is_new] += step[0, 3]
         decrease = float(model.edges.decrease(step)[edge])
         assert before - loss(change.mesh, moved) == pytest.approx(decrease, rel=0.03, abs=2e-3 * before)
-    gains = flip_gains(flips, values, model)
+    gains = flip_gains(flips, flips.surplus(values), model)
     for one in (flips.kind == TWO_TO_THREE).nonzero().flatten()[:8]:
         after = loss(apply_flips(flips.select(one[None])).mesh, density)
         assert before - after == pytest.approx(float(gains[one]), rel=0.1, abs=2e-3 * before)

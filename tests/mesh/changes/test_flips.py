@@ -284,7 +284,9 @@ def test_what_is_there_already_is_not_made_again():
 def test_closed_rings_are_the_cells_in_order(seed):
     mesh = random_mesh(seed)
     for size in (3, 4, 5, 6):
-        edges, rings, cells = closed_rings(mesh.topology, size)
+        found = closed_rings(mesh.topology, size)
+        edges, rings, cells = found.edge, found.vertices, found.cells
+        assert torch.equal(mesh.topology.edges[found.rows.long()], edges)
         expected = {}
         for edge, of_edge in around(mesh, 2).items():
             if len(of_edge) == size and link_cycle(mesh, edge, of_edge):
@@ -299,7 +301,7 @@ def test_an_edge_where_cells_only_touch_has_no_ring():
     points = [[0, 0, -1], [0, 0, 1], [1, 0, 0], [1, 1, 0], [0, 1, 0], [-1, 0, 0], [-1, -1, 0], [0, -1, 0.0]]
     cells = [[2, 3, 0, 1], [3, 4, 0, 1], [5, 6, 0, 1], [6, 7, 0, 1]]
     mesh = TetMesh(torch.tensor(points), cells)
-    assert closed_rings(mesh.topology, 4)[0].shape == (0, 2)
+    assert closed_rings(mesh.topology, 4).edge.shape == (0, 2)
     assert find_flips(mesh).kind.tolist() == [TWO_TO_THREE] * 2
 
 

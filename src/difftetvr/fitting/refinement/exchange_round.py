@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
@@ -14,7 +15,7 @@ from difftetvr.fitting.refinement.gains import (
     edges_before,
     face_steps,
     flip_gains,
-    vanishing_edges,
+    takes_edge,
 )
 from difftetvr.fitting.refinement.strategy import Refinement, Situation
 from difftetvr.mesh.arrays import chunks, sort_keys, true_indices
@@ -46,7 +47,7 @@ def exchange_cells(situation: Situation, target: int, options: Exchange) -> Refi
         options: How much of what.
     """
     mesh = situation.mesh
-    flips = find_flips(mesh, min_quality=options.min_quality) if options.flips else None
+    flips = _Flips.of(mesh, situation.values, options.min_quality) if options.flips else None
     may_bisect = long_edges(mesh, options.long)
     model = situation.model(_hats_of(mesh, situation.values, may_bisect, flips))
     exchange = _Round(situation, model, may_bisect, options)
@@ -58,12 +59,31 @@ def exchange_cells(situation: Situation, target: int, options: Exchange) -> Refi
     return exchange.refinement()
 
 
-def _hats_of(mesh: TetMesh, values: torch.Tensor, may_bisect: torch.Tensor, flips: Flips | None) -> HatChoice:
+def _hats_of(mesh: TetMesh, values: torch.Tensor, may_bisect: torch.Tensor, flips: _Flips | None) -> HatChoice:
     """What has to be known: of edges that may be bisected, and of what flips would take away."""
     if flips is None:
         return HatChoice(may_bisect, values.new_zeros((mesh.topology.faces.shape[0], 4)))
-    edges = may_bisect.index_fill(0, vanishing_edges(flips)[1], True)
-    return HatChoice(edges, face_steps(flips, values))
+    edges = flips.all.vanishes[true_indices(takes_edge(flips.all))].long()
+    return HatChoice(may_bisect.index_fill(0, edges, True), face_steps(flips.all, flips.surplus))
+
+
+@dataclass(frozen=True)
+class _Flips:
+    """All possible flips of a mesh, and (N, 4) what they add to the parameters, see `Flips.surplus`."""
+
+    all: Flips
+    surplus: torch.Tensor
+
+    @staticmethod
+    def of(mesh: TetMesh, values: torch.Tensor, min_quality: float) -> _Flips:
+        """Looks for them."""
+        flips = find_flips(mesh, min_quality=min_quality)
+        return _Flips(flips, flips.surplus(values))
+
+    def worthwhile(self, gain: torch.Tensor, reach: float) -> tuple[Flips, torch.Tensor]:
+        """Those that win something, with what they win; of changes that are too great nothing is known."""
+        rows = true_indices((gain > 0) & (self.surplus.abs().amax(1) <= reach))
+        return self.all.select(rows), gain[rows]
 
 
 class _Round:
@@ -82,21 +102,19 @@ class _Round:
         self.predicted = 0.0
         self.flipped = 0
 
-    def flip(self, flips: Flips, model: ImageModel, target: int, options: Exchange) -> None:
+    def flip(self, flips: _Flips, model: ImageModel, target: int, options: Exchange) -> None:
         """Cut the same space otherwise where that fits the images better."""
         # A 2-3 flip makes a cell more, a 3-2 flip one less: one that a bisection could use.
-        cells = torch.where(flips.kind == TWO_TO_THREE, 1, torch.where(flips.kind == THREE_TO_TWO, -1, 0))
-        gain = flip_gains(flips, self.values, model) - self._price_of_a_cell(options) * cells
-        # Of changes that are too great nothing is known.
-        worthwhile = true_indices((gain > 0) & (flips.surplus(self.values).abs().amax(1) <= self.reach))
-        flips, gain = flips.select(worthwhile), gain[worthwhile]
-        chosen = independent_flips(flips, gain)
+        kind = flips.all.kind
+        cells = torch.where(kind == TWO_TO_THREE, 1, torch.where(kind == THREE_TO_TWO, -1, 0))
+        gain = flip_gains(flips.all, flips.surplus, model) - self._price_of_a_cell(options) * cells
+        chosen = independent_flips(*flips.worthwhile(gain, self.reach))
         # What collapses cannot take away again must not be added.
         room = max(0, target - self.mesh.num_cells) + int(options.share * self.mesh.num_cells)
         adds = (chosen.kind == TWO_TO_THREE).int()
         chosen = chosen.select(adds.cumsum(0) * adds <= room)
         self.flipped = len(chosen)
-        self.predicted += float(flip_gains(chosen, self.values, model).sum())
+        self.predicted += float(flip_gains(chosen, chosen.surplus(self.values), model).sum())
         change = apply_flips(chosen)
         self._carry_edges(change, _changed_cells(self.mesh, change))
         self._apply(change)

@@ -14,9 +14,9 @@ import torch
 from difftetvr.fitting.refinement.collapse_kernel import costs_of_collapses
 from difftetvr.mesh.arrays import true_indices
 from difftetvr.mesh.changes.change import MeshChange
-from difftetvr.mesh.changes.flips import FOUR_TO_FOUR, TWO_TO_THREE, Flips
+from difftetvr.mesh.changes.flips import TWO_TO_THREE, Flips
 from difftetvr.mesh.tetmesh import TetMesh
-from difftetvr.mesh.topology.incidence import cell_faces, cells_per_edge, find_edges
+from difftetvr.mesh.topology.incidence import cells_per_edge, find_edges
 from difftetvr.mesh.topology.topology import Topology
 from difftetvr.rendering.gauss_newton import HatDerivatives, ImageModel
 
@@ -154,7 +154,7 @@ def _neighbour_mean(edges: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
     return sums / counts.clamp_min(1.0)[:, None]
 
 
-def flip_gains(flips: Flips, values: torch.Tensor, model: ImageModel) -> torch.Tensor:
+def flip_gains(flips: Flips, surplus: torch.Tensor, model: ImageModel) -> torch.Tensor:
     """Predicts what flips would win.
 
     A flip changes the field by a surplus where what vanishes and what appears cross, falling to 0 at the outer faces of
@@ -162,54 +162,40 @@ def flip_gains(flips: Flips, values: torch.Tensor, model: ImageModel) -> torch.T
 
     Args:
         flips: Flips of the mesh that the model is of.
-        values: (V, 4) parameters.
+        surplus: (N, 4) what they add to the parameters there, see `Flips.surplus`.
         model: Derivatives.
 
     Returns:
         (N,) predicted decrease of the error.
     """
-    surplus = flips.surplus(values)
-    gain = torch.zeros_like(surplus[:, 0])
-    by_face = true_indices(flips.kind == TWO_TO_THREE)
-    faces = _vanishing_faces(flips, by_face)
+    gain = model.edges.gradient.new_zeros(len(flips))
+    by_face, by_edge = (true_indices(mask) for mask in (~takes_edge(flips), takes_edge(flips)))
+    faces, edges = flips.vanishes[by_face].long(), flips.vanishes[by_edge].long()
     if model.faces is None:
         assert model.face_steps is not None
         gain[by_face] = model.face_steps.decrease()[faces]
     else:
         gain[by_face] = model.faces[faces].decrease(surplus[by_face])
-    by_edge, edges = vanishing_edges(flips)
     gain[by_edge] = model.edges[edges].decrease(surplus[by_edge])
     return gain
 
 
-def vanishing_edges(flips: Flips) -> tuple[torch.Tensor, torch.Tensor]:
-    """Which flips take an edge away, (N,) int64, and which edge, (N,) indices into ``topology.edges``."""
-    by_edge = true_indices(flips.kind != TWO_TO_THREE)
-    is_ring = (flips.kind[by_edge] == FOUR_TO_FOUR)[:, None]
-    ends = torch.where(is_ring, flips.ring[by_edge][:, [0, 2]], flips.edge[by_edge])
-    return by_edge, find_edges(flips.mesh.topology, ends.long())
+def takes_edge(flips: Flips) -> torch.Tensor:
+    """(N,) bool, which flips take an edge away; the others take a face."""
+    return flips.kind != TWO_TO_THREE
 
 
-def face_steps(flips: Flips, values: torch.Tensor) -> torch.Tensor:
+def face_steps(flips: Flips, surplus: torch.Tensor) -> torch.Tensor:
     """(F, 4) what flips add to the hats of the faces that they take away; 0 for all other faces.
 
     Args:
         flips: All possible flips of a mesh.
-        values: (V, 4) parameters.
+        surplus: (N, 4) what they add to the parameters, see `Flips.surplus`.
     """
-    by_face = true_indices(flips.kind == TWO_TO_THREE)
-    steps = values.new_zeros((flips.mesh.topology.faces.shape[0], 4))
-    steps[_vanishing_faces(flips, by_face)] = flips.select(by_face).surplus(values)
+    by_face = true_indices(~takes_edge(flips))
+    steps = surplus.new_zeros((flips.mesh.topology.faces.shape[0], 4))
+    steps[flips.vanishes[by_face].long()] = surplus[by_face]
     return steps
-
-
-def _vanishing_faces(flips: Flips, rows: torch.Tensor) -> torch.Tensor:
-    """(N,) indices into ``topology.faces`` of the faces that 2-3 flips take away; ``rows`` says which flips."""
-    topology = flips.mesh.topology
-    first = flips.cells[rows, 0].long()
-    # The vanishing face lies opposite the end of the new edge that is a corner of the first cell.
-    opposite = (topology.tets[first][:, :, None] == flips.edge[rows, None, :]).any(2).int().argmax(1)
-    return cell_faces(topology)[first, opposite].long()
 
 
 def edges_before(topology: Topology, change: MeshChange) -> torch.Tensor:

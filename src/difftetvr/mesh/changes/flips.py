@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from typing import TypeVar
 
 import torch
 
@@ -30,6 +31,8 @@ from difftetvr.mesh.topology.topology import Topology
 
 TWO_TO_THREE, THREE_TO_TWO, FOUR_TO_FOUR = 2, 3, 4
 """Kinds of flips, each the number of cells that vanish."""
+
+X = TypeVar("X")
 
 _ITEM_BITS = 32
 _ITEM_MASK = (1 << _ITEM_BITS) - 1
@@ -47,6 +50,8 @@ class Flips:
     Attributes:
         mesh: The mesh that they are flips of.
         kind: (N,) int8, TWO_TO_THREE, THREE_TO_TWO or FOUR_TO_FOUR.
+        vanishes: (N,) int32, the face of `mesh.topology.faces` that vanishes in a 2-3 flip, the edge of
+            `mesh.topology.edges` that does in any other.
         cells: (N, 4) int32, the cells that vanish, then -1.
         edge: (N, 2) int32, the ends of the edge.
         ring: (N, 4) int32, the vertices around it, counter-clockwise seen from edge[1]; the fourth is -1 where there
@@ -59,6 +64,7 @@ class Flips:
 
     mesh: TetMesh
     kind: torch.Tensor
+    vanishes: torch.Tensor
     cells: torch.Tensor
     edge: torch.Tensor
     ring: torch.Tensor
@@ -186,7 +192,8 @@ def apply_flips(flips: Flips, priority: torch.Tensor | None = None) -> MeshChang
     parents = torch.repeat_interleave(counts)
     tets = mesh.tets.index_select(0, parents)
     for kind, rows in is_kind.items():
-        new = cells_after(kind, chosen.edge[rows], chosen.ring[rows])
+        after = cells_after(kind, chosen.edge[rows].unbind(1), chosen.ring[rows].unbind(1))
+        new = torch.stack([torch.stack(cell, 1) for cell in after])
         places = list(first_place[chosen.cells[rows, :kind].long()].unbind(1))
         if kind == TWO_TO_THREE:
             places.insert(1, places[0] + 1)
@@ -195,25 +202,23 @@ def apply_flips(flips: Flips, priority: torch.Tensor | None = None) -> MeshChang
     return with_vertices_kept(mesh, kept, Topology(tets, mesh.num_vertices), parents.int())
 
 
-def cells_after(kind: int, edge: torch.Tensor, ring: torch.Tensor) -> torch.Tensor:
+def cells_after(kind: int, edge: Sequence[X], ring: Sequence[X]) -> list[tuple[X, X, X, X]]:
     """The cells that flips of one kind make.
 
     Args:
         kind: TWO_TO_THREE, THREE_TO_TWO or FOUR_TO_FOUR.
-        edge: (N, 2), see `Flips`.
-        ring: (N, 3 or 4), see `Flips`.
+        edge: The two ends, see `Flips`.
+        ring: The three or four vertices around it, see `Flips`; of three what follows does not matter.
 
     Returns:
-        (M, N, 4) corners of the M cells of each flip, positively oriented where the flip is possible.
+        Corners of the new cells, positively oriented where the flip is possible.
     """
-    p, q = edge.unbind(1)
-    corners = ring[:, : 4 if kind == FOUR_TO_FOUR else 3].unbind(1)
+    p, q = edge
     if kind == THREE_TO_TWO:
-        a, b, c = corners
-        cells = [(a, c, b, p), (a, b, c, q)]
-    else:
-        cells = [(corner, following, p, q) for corner, following in zip(corners, (*corners[1:], corners[0]))]
-    return torch.stack([torch.stack(cell, 1) for cell in cells])
+        a, b, c = ring[:3]
+        return [(a, c, b, p), (a, b, c, q)]
+    corners = ring[: 4 if kind == FOUR_TO_FOUR else 3]
+    return [(corner, following, p, q) for corner, following in zip(corners, (*corners[1:], corners[0]))]
 
 
 def _conflicts(flips: Flips) -> torch.Tensor:

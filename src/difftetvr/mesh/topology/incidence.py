@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from difftetvr.errors import MeshError
-from difftetvr.mesh.arrays import chunks, put, true_indices
+from difftetvr.mesh.topology.lookup import EdgeRows, edges_of_cells, faces_of_cells, places_of_edges
 from difftetvr.mesh.topology.topology import LOCAL_EDGES, Topology
 
 
@@ -58,14 +58,9 @@ def find_edges(topology: Topology, ends: torch.Tensor) -> torch.Tensor:
     Returns:
         (N,) int64 indices into `topology.edges`, -1 where two vertices share no edge.
     """
-    edges = topology.edges
-    if not edges.shape[0]:
+    if not topology.edges.shape[0] or not ends.shape[0]:
         return torch.full_like(ends[:, 0], -1)
-    rows = topology.cached("incidence.edge_rows", lambda: _edge_rows(topology))
-    found = torch.empty(ends.shape[0], dtype=torch.int64, device=ends.device)
-    for part in chunks(ends.shape[0], ends.device):
-        found[part] = _places_in_rows(*rows, ends[part])
-    return found
+    return places_of_edges(_edge_rows(topology), *ends.unbind(1)).long()
 
 
 def known_edges(topology: Topology, edges: torch.Tensor) -> torch.Tensor:
@@ -158,50 +153,21 @@ def _build_shell(topology: Topology) -> Topology:
     return Topology(faces, topology.num_vertices + 1)
 
 
-def _edge_rows(topology: Topology) -> tuple[torch.Tensor, torch.Tensor]:
-    """Where the edges of each lower end begin (V + 1,), and the higher end of each edge (E,), both int32."""
+def _edge_rows(topology: Topology) -> EdgeRows:
+    return topology.cached("incidence.edge_rows", lambda: _build_edge_rows(topology))
+
+
+def _build_edge_rows(topology: Topology) -> EdgeRows:
     lower, higher = topology.edges.unbind(1)
     counts = torch.bincount(lower, minlength=topology.num_vertices)
-    return torch.nn.functional.pad(counts.cumsum(0), (1, 0)).int(), higher.contiguous()
-
-
-def _places_in_rows(offsets: torch.Tensor, higher: torch.Tensor, ends: torch.Tensor) -> torch.Tensor:
-    """(N,) int64 place of pairs of vertices among the edges, of which there is one at least; -1 for others."""
-    one, other = ends.int().unbind(1)
-    low, high = torch.minimum(one, other), torch.maximum(one, other)
-    # Halving the edges of the lower end: they are so few that this takes a fraction of a search among all edges.
-    place = offsets.index_select(0, low)
-    left = offsets.index_select(0, low + 1) - place
-    is_known = left > 0
-    for _ in range((int(left.max()) - 1).bit_length()):
-        half = left >> 1
-        is_before = higher.index_select(0, (place + half).sub_(1).clamp_min_(0)) < high
-        place.add_(half * is_before)
-        left.sub_(half)
-    is_known &= higher.index_select(0, place.clamp_max_(higher.shape[0] - 1)) == high
-    return torch.where(is_known, place.long(), -1)
+    return EdgeRows(torch.nn.functional.pad(counts.cumsum(0), (1, 0)).int(), higher.contiguous())
 
 
 def _build_cell_faces(topology: Topology) -> torch.Tensor:
-    table = torch.empty((topology.num_cells, 4), dtype=torch.int32, device=topology.tets.device)
-    for column in (0, 1):
-        cells = topology.face_cells[:, column].long()
-        faces = true_indices(cells >= 0)
-        for part in chunks(faces.shape[0], faces.device, width=12):
-            face, cell = faces[part], cells[faces[part]]
-            corners = topology.tets[cell]
-            # The one corner that the face lacks.
-            apex = corners.sum(1, keepdim=True, dtype=torch.int64) - topology.faces[face].sum(1, keepdim=True)
-            put(table.view(-1), 4 * cell + (corners == apex).int().argmax(1), face.int())
-    return table
+    return faces_of_cells(topology.cell_adjacency) if topology.num_cells else topology.tets
 
 
 def _build_cell_edges(topology: Topology) -> torch.Tensor:
-    tets = topology.tets
-    table = torch.empty((tets.shape[0], 6), dtype=torch.int32, device=tets.device)
-    for part in chunks(tets.shape[0], tets.device, width=6):
-        corners = tets[part].unbind(1)
-        ends = torch.stack([torch.stack((corners[i], corners[j]), 1) for i, j in LOCAL_EDGES], 1)
-        # Looked up in rows of a few edges each, in a fifth of the time that sorting all pairs of ends takes.
-        table[part] = find_edges(topology, ends.view(-1, 2)).view(-1, 6)
-    return table
+    if not topology.num_cells:
+        return topology.tets.new_empty((0, len(LOCAL_EDGES)))
+    return edges_of_cells(_edge_rows(topology), topology.tets.t().contiguous())

@@ -1,22 +1,47 @@
-"""Edges with few cells around them, and these cells in their order around the edge."""
+"""Edges with few cells around them, and these cells in their order around the edge (Dr.Jit kernels)."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
 import torch
 
-from difftetvr.mesh.arrays import chunks, constant, sort_keys, true_indices
-from difftetvr.mesh.topology.incidence import cell_edges
+from difftetvr.backend import Backend, get_backend
+from difftetvr.mesh.arrays import constant, true_indices
+from difftetvr.mesh.topology.incidence import cell_edges, cells_per_edge
 from difftetvr.mesh.topology.topology import LOCAL_EDGES, Topology
+from difftetvr.recording import few_lengths, replayed
 
 _OTHER_CORNERS = ((2, 3), (3, 1), (1, 2), (0, 3), (2, 0), (0, 1))
 """For each of `LOCAL_EDGES` i, j the other corners x, y, such that x, y, i, j is an even permutation."""
 
 _PATTERNS = tuple((*others, *edge) for others, edge in zip(_OTHER_CORNERS, LOCAL_EDGES, strict=True))
-_PLACE_BITS = 32
-_PLACE_MASK = (1 << _PLACE_BITS) - 1
+_NONE = 0xFFFFFFFF
+"""-1 in kernels."""
 
 
-def closed_rings(topology: Topology, size: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+@dataclass(frozen=True)
+class Rings:
+    """Inner edges that have so many cells around them, and what lies around them.
+
+    `vertices[k]`, `vertices[k + 1]` and the two of `edge` are the corners of `cells[k]`, positively oriented.
+
+    Attributes:
+        rows: (N,) int32, the edges as indices into `topology.edges`, ascending.
+        edge: (N, 2) int32, their vertices, the smaller one first.
+        vertices: (N, size) int32, the vertices around them.
+        cells: (N, size) int32, the cells around them, from the one with the lowest number on.
+    """
+
+    rows: torch.Tensor
+    edge: torch.Tensor
+    vertices: torch.Tensor
+    cells: torch.Tensor
+
+
+def closed_rings(topology: Topology, size: int) -> Rings:
     """The inner edges that have a given number of cells around them, and what lies around them.
 
     Args:
@@ -24,63 +49,93 @@ def closed_rings(topology: Topology, size: int) -> tuple[torch.Tensor, torch.Ten
         size: Number of cells around an edge, at least 3.
 
     Returns:
-        edge (N, 2) int32, the smaller vertex first; ring (N, size) int32, the vertices around it; and cells (N, size)
-        int32, such that ring[k], ring[k + 1], edge[0], edge[1] are the corners of cells[k], positively oriented.
-        Edges on the boundary are left out, and so are edges at which the mesh merely touches itself.
+        All such edges, but for those at which the mesh merely touches itself.
     """
-    places = _cells_by_edge(cell_edges(topology), size)
-    none = topology.tets[:0, :1]
-    edges, rings, around = [none.expand(0, 2)], [none.expand(0, size)], [none.expand(0, size)]
-    for part in chunks(places.shape[0], places.device, width=4 * size):
-        cells = places[part] // len(LOCAL_EDGES)
-        corners = _corners_around(topology.tets, cells, places[part] % len(LOCAL_EDGES))
-        ring, order, is_closed = _walk(corners[..., 0], corners[..., 1])
-        rows = true_indices(is_closed)
-        edges.append(corners[rows, 0, 2:])
-        rings.append(ring[rows])
-        around.append(cells.gather(1, order)[rows].int())
-    return torch.cat(edges), torch.cat(rings), torch.cat(around)
+    rows = true_indices(cells_per_edge(topology) == size)
+    if not rows.shape[0]:
+        none = topology.tets.new_empty((0, size))
+        return Rings(none[:, 0], none[:, :2], none, none)
+    places = topology.cached("rings.first_places", lambda: _first_places(topology)).index_select(0, rows)
+    patterns = constant(_PATTERNS, topology.tets.device).int()
+    backend = get_backend(str(topology.tets.device))
+    with backend.exclusive():
+        tables = (backend.uints(table) for table in (places, patterns, topology.tets, topology.cell_adjacency))
+        found = replayed(_walk, _Fans(backend, *tables), size)
+        backend.run(found)
+        is_closed, *columns = (backend.tensor(column) for column in found)
+    closed = true_indices(is_closed > 0)
+    ring, cells = (torch.stack([column.index_select(0, closed) for column in c], 1) for c in _halves(columns))
+    rows = rows.index_select(0, closed)
+    return Rings(rows.int(), topology.edges.index_select(0, rows), ring, cells)
 
 
-def _cells_by_edge(table: torch.Tensor, size: int) -> torch.Tensor:
-    """Places in the table of cells' edges, (N, size) int64, a row for each edge that has `size` cells."""
-    degree = torch.bincount(table.view(-1))
-    keys = [table.new_empty(0, dtype=torch.int64)]
-    for part in chunks(table.shape[0], table.device, width=6):
-        edges = table[part].reshape(-1)
-        rows = true_indices(degree.index_select(0, edges) == size)
-        keys.append((edges[rows].long() << _PLACE_BITS) | (rows + len(LOCAL_EDGES) * part.start))
-    return (sort_keys(torch.cat(keys)) & _PLACE_MASK).view(-1, size)
+def _halves(columns: list[torch.Tensor]) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
+    return columns[: len(columns) // 2], columns[len(columns) // 2 :]
 
 
-def _corners_around(tets: torch.Tensor, cells: torch.Tensor, local_edges: torch.Tensor) -> torch.Tensor:
-    """Corners x, y, i, j of cells (N, K, 4), positively oriented; i, j is the edge, i < j."""
-    places = 4 * cells[..., None] + constant(_PATTERNS, tets.device)[local_edges]
-    corners = tets.view(-1).index_select(0, places.view(-1)).view(places.shape)
-    return torch.where((corners[..., 2] > corners[..., 3])[..., None], corners[..., [1, 0, 3, 2]], corners)
+def _first_places(topology: Topology) -> torch.Tensor:
+    """(E,) int32 the lowest place of each edge in the table of cells' edges."""
+    count, table = topology.edges.shape[0], cell_edges(topology)
+    backend = get_backend(str(table.device))
+    with backend.exclusive():
+        return backend.tensor(replayed(_lowest_places, backend, backend.uints(table), few_lengths(count)))[:count]
 
 
-def _walk(starts: torch.Tensor, ends: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Go round edges from cell to cell.
+# ---- Kernels
 
-    No start comes twice in a row, and no cell leads back to where another came from: both would be overlaps, which no
-    valid mesh has. So a walk that closes after as many steps as there are cells has been in each of them.
 
-    Args:
-        starts: (N, K), where each cell around an edge begins.
-        ends: (N, K), where it ends.
+@dataclass
+class _Fans:
+    """Edges and the cells around them, flat.
 
-    Returns:
-        ring (N, K), the starts in order; order (N, K) int64, the cells in order; and closed (N,) bool.
+    Attributes:
+        backend: Array types.
+        places: (N,) a place of each edge in the table of cells' edges.
+        patterns: (6, 4) corners of a cell by its edge: the others, and its ends.
+        tets: (T, 4) vertices of cells.
+        adjacency: (T, 4) neighbours of cells.
     """
-    first = starts[:, :1]
-    now, ring, order = first, [], []
-    is_closed = torch.ones(starts.shape[0], dtype=torch.bool, device=starts.device)
-    for _ in range(starts.shape[1]):
-        follows = starts == now
-        is_closed &= follows.any(1)
-        step = follows.int().argmax(1, keepdim=True)
-        ring.append(now)
-        order.append(step)
-        now = ends.gather(1, step)
-    return torch.cat(ring, 1), torch.cat(order, 1), is_closed & (now == first)[:, 0]
+
+    backend: Backend
+    places: Any
+    patterns: Any
+    tets: Any
+    adjacency: Any
+
+
+def _lowest_places(backend: Backend, table: Any, length: int) -> Any:
+    result = dr.full(backend.UInt, _NONE, length)
+    dr.scatter_reduce(dr.ReduceOp.Min, result, dr.arange(backend.UInt, dr.width(table)), table)
+    result = backend.Int(result)
+    dr.eval(result)
+    return result
+
+
+def _walk(fans: _Fans, size: int) -> list[Any]:
+    """Go round edges from cell to cell: whether so many lead back to the first, the vertices, and the cells."""
+    uint, edges = fans.backend.UInt, len(LOCAL_EDGES)
+    cell = fans.places // edges
+    pattern = dr.gather(fans.backend.UInt4, fans.patterns, fans.places - edges * cell)
+    x, y, i, j = (dr.gather(uint, fans.tets, 4 * cell + pattern[k]) for k in range(4))
+    is_ascending = i < j
+    first, vertex = dr.select(is_ascending, x, y), dr.select(is_ascending, y, x)
+    first_cell, behind = cell, first
+    vertices, cells, is_closed = [first], [cell], dr.full(fans.backend.Bool, True, dr.width(fans.places))
+    for step in range(size):
+        corners = dr.gather(fans.backend.UInt4, fans.tets, cell, is_closed)
+        across = uint(0)
+        for k in range(1, 4):
+            across = dr.select(corners[k] == behind, k, across)
+        cell = dr.gather(uint, fans.adjacency, 4 * cell + across, is_closed)
+        is_closed &= cell != _NONE
+        corners = dr.gather(fans.backend.UInt4, fans.tets, cell, is_closed)
+        behind, vertex = vertex, corners[0] + corners[1] + corners[2] + corners[3] - vertex - i - j
+        if step < size - 1:
+            vertices.append(behind)
+            cells.append(cell)
+            is_closed &= behind != first
+    is_closed &= (cell == first_cell) & (behind == first)
+    integer = fans.backend.Int
+    result = [dr.select(is_closed, integer(1), integer(0)), *map(integer, vertices), *map(integer, cells)]
+    dr.eval(result)
+    return result

@@ -1,0 +1,176 @@
+"""Edges and faces looked up for millions of cells at once (Dr.Jit kernels)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import torch
+
+from difftetvr.backend import Backend, get_backend
+from difftetvr.mesh.topology.topology import LOCAL_EDGES, Topology
+from difftetvr.recording import replayed
+
+_NONE = 0xFFFFFFFF
+"""-1 in kernels."""
+
+
+@dataclass(frozen=True)
+class EdgeRows:
+    """Edges in rows, one for each vertex: its neighbours of a higher number, ascending.
+
+    Attributes:
+        offsets: (V + 1,) int32, where rows begin.
+        higher: (E,) int32, at least one.
+    """
+
+    offsets: torch.Tensor
+    higher: torch.Tensor
+
+
+def places_of_edges(rows: EdgeRows, one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
+    """(N,) int32 places of edges between (N,) vertices, -1 where there is none; N is not 0."""
+    backend = _backend(rows.higher)
+    with backend.exclusive():
+        return backend.tensor(replayed(_places, _rows(backend, rows), backend.uints(one), backend.uints(other)))
+
+
+def edges_of_cells(rows: EdgeRows, corners: torch.Tensor) -> torch.Tensor:
+    """(T, 6) int32 places of the edges of cells, in the order of `LOCAL_EDGES`.
+
+    Args:
+        rows: All edges there are.
+        corners: (4, T) int32 vertices of the cells, not of none.
+    """
+    backend = _backend(corners)
+    with backend.exclusive():
+        found = replayed(_edges_of_cells, _rows(backend, rows), [backend.uints(column) for column in corners])
+        backend.run(found)
+        return torch.stack([backend.tensor(column) for column in found], 1)
+
+
+def faces_of_cells(adjacency: torch.Tensor) -> torch.Tensor:
+    """(T, 4) int32 faces of cells, numbered in the order of the cells that they are first of.
+
+    Args:
+        adjacency: (T, 4) int32 neighbours, see :class:`difftetvr.mesh.Topology`; not of none.
+    """
+    backend = _backend(adjacency)
+    with backend.exclusive():
+        across = backend.uints(adjacency)
+        is_first = backend.tensor(replayed(_is_first_of_face, backend, across))
+        rank = is_first.cumsum(0, dtype=torch.int32)
+        return backend.tensor(replayed(_faces_of_corners, backend, across, backend.uints(rank)), -1, 4)
+
+
+def are_faces(topology: Topology, corners: torch.Tensor) -> torch.Tensor:
+    """(N,) bool, whether some cell has three vertices together.
+
+    Args:
+        topology: The cells.
+        corners: (N, 3) int32 vertices, all different.
+    """
+    if not corners.shape[0]:
+        return torch.zeros_like(corners[:, 0], dtype=torch.bool)
+    backend = _backend(corners)
+    with backend.exclusive():
+        stars = _Stars(backend, *map(backend.uints, (*topology.vertex_cells, topology.tets)))
+        columns = [backend.uints(column) for column in corners.unbind(1)]
+        return backend.tensor(replayed(_are_faces, stars, columns)) > 0
+
+
+def _backend(table: torch.Tensor) -> Backend:
+    return get_backend(str(table.device))
+
+
+def _rows(backend: Backend, rows: EdgeRows) -> _Rows:
+    return _Rows(backend, backend.uints(rows.offsets), backend.uints(rows.higher))
+
+
+# ---- Kernels
+
+
+@dataclass
+class _Rows:
+    """:class:`EdgeRows` as kernels read them."""
+
+    backend: Backend
+    offsets: Any
+    higher: Any
+
+    def place(self, one: Any, other: Any) -> Any:
+        """Place of the edge between two vertices."""
+        uint, is_lower = self.backend.UInt, one < other
+        low, high = dr.select(is_lower, one, other), dr.select(is_lower, other, one)
+        first = dr.gather(uint, self.offsets, low)
+        count = dr.gather(uint, self.offsets, low + 1) - first
+
+        def halve(place: Any, left: Any) -> tuple[Any, Any]:
+            half = left >> 1
+            is_behind = dr.gather(uint, self.higher, place + half - 1) < high
+            return dr.select(is_behind, place + half, place), left - half
+
+        place, _ = dr.while_loop((first, count), lambda _, left: left > 1, halve)
+        is_there = (count > 0) & (dr.gather(uint, self.higher, place, count > 0) == high)
+        return dr.select(is_there, place, _NONE)
+
+
+def _places(rows: _Rows, one: Any, other: Any) -> Any:
+    result = rows.backend.Int(rows.place(one, other))
+    dr.eval(result)
+    return result
+
+
+def _edges_of_cells(rows: _Rows, corners: list[Any]) -> list[Any]:
+    result = [rows.backend.Int(rows.place(corners[i], corners[j])) for i, j in LOCAL_EDGES]
+    dr.eval(result)
+    return result
+
+
+def _is_first_of_face(backend: Backend, across: Any) -> Any:
+    """1 where a corner's face has no cell of a lower number behind it, else 0."""
+    cell = dr.arange(backend.UInt, dr.width(across)) >> 2
+    result = dr.select(across > cell, backend.Int(1), backend.Int(0))
+    dr.eval(result)
+    return result
+
+
+def _faces_of_corners(backend: Backend, across: Any, rank: Any) -> Any:
+    """The face opposite each corner, by the number of first corners up to each."""
+    corner = dr.arange(backend.UInt, dr.width(across))
+    cell = corner >> 2
+    is_first = across > cell
+    behind = dr.gather(backend.UInt4, across, across, ~is_first)
+    twin = 4 * across
+    for k in range(1, 4):
+        twin = dr.select(behind[k] == cell, 4 * across + k, twin)
+    result = backend.Int(dr.gather(backend.UInt, rank, dr.select(is_first, corner, twin)) - 1)
+    dr.eval(result)
+    return result
+
+
+@dataclass
+class _Stars:
+    """Cells around vertices, see :attr:`difftetvr.mesh.Topology.vertex_cells`, and their (T, 4) vertices, flat."""
+
+    backend: Backend
+    offsets: Any
+    cells: Any
+    tets: Any
+
+
+def _are_faces(stars: _Stars, corners: list[Any]) -> Any:
+    uint, (first, second, third) = stars.backend.UInt, corners
+    begin, end = (dr.gather(uint, stars.offsets, first + k) for k in range(2))
+
+    def look(place: Any, found: Any) -> tuple[Any, Any]:
+        tet = dr.gather(stars.backend.UInt4, stars.tets, dr.gather(uint, stars.cells, place))
+        has = [(tet[0] == v) | (tet[1] == v) | (tet[2] == v) | (tet[3] == v) for v in (second, third)]
+        return place + 1, dr.select(has[0] & has[1], uint(1), found)
+
+    state = (begin, dr.zeros(uint, dr.width(first)))
+    _, found = dr.while_loop(state, lambda place, found: (place < end) & (found == 0), look)
+    result = stars.backend.Int(found)
+    dr.eval(result)
+    return result
