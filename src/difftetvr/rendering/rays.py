@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import math
+import operator
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -69,12 +71,11 @@ class Rays:
         self._require_sound()
 
     def _require_sound(self) -> None:
+        if not self.directions.numel() or self._is_sound():
+            return
         o, d, near, far = (tensor.detach() for tensor in (self.origins, self.directions, self.ends[0], self.ends[1]))
         length = d.abs().amax(-1)
-        ordered = (near <= far) & (near < math.inf) & (far > -math.inf)
-        bad = ~(torch.isfinite(o).all(-1) & torch.isfinite(length) & (length > 0) & ordered)
-        if not bool(bad.any()):
-            return
+        bad = ~(torch.isfinite(o).all(-1) & torch.isfinite(length) & (length > 0) & _are_ordered(near, far))
         place = tuple(torch.nonzero(bad)[0].tolist())
         where = f"Ray {place[0] if len(place) == 1 else place}"
         if not bool(torch.isfinite(o[place]).all()):
@@ -87,6 +88,15 @@ class Rays:
             f"{where} is looked at from {float(near[place])} to {float(far[place])}; near must not be beyond far, nor "
             "both of them infinitely far away on one side."
         )
+
+    def _is_sound(self) -> bool:
+        """Whether all rays are sound, without a look at which: in a fraction of that time."""
+        directions = self.directions.detach()
+        are_ordered = torch.as_tensor(_are_ordered(self.near, self.far)).all()
+        x, y, z = directions.unbind(-1)
+        is_any_zero = ((x == 0) & (y == 0) & (z == 0)).any()
+        finite = [torch.isfinite(end) for part in (self._starts.detach(), directions) for end in torch.aminmax(part)]
+        return bool(functools.reduce(operator.and_, finite) & ~is_any_zero & are_ordered)
 
     @property
     def ends(self) -> tuple[torch.Tensor, torch.Tensor]:
@@ -201,6 +211,11 @@ class Rays:
             torch.cat([getattr(b, name).reshape(-1, 3) for b in bundles]) for name in ("origins", "directions")
         )
         return Rays(origins, directions, *_shared_ends(bundles, lambda ends: torch.cat([e.reshape(-1) for e in ends])))
+
+
+def _are_ordered(near: torch.Tensor | float, far: torch.Tensor | float) -> torch.Tensor | bool:
+    """Whether there is something between ``near`` and ``far``; not where one of them is no number."""
+    return (near <= far) & (near < math.inf) & (far > -math.inf)
 
 
 def _require_one_device(bundles: Sequence[Rays]) -> None:

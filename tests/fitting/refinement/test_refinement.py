@@ -162,7 +162,9 @@ def test_flips_gain_the_same_by_the_one_step_that_is_asked_for(scene):
     asked = model_image(mesh, field_of(values), CAMERA, truth, transmittance_threshold=0.0, hats=hats)
     assert asked.faces is None
     expected = flip_gains(flips, flips.surplus(values), model)
-    torch.testing.assert_close(flip_gains(flips, flips.surplus(values), asked), expected, rtol=1e-9, atol=1e-9 * float(expected.max()))
+    torch.testing.assert_close(
+        flip_gains(flips, flips.surplus(values), asked), expected, rtol=1e-9, atol=1e-9 * float(expected.max())
+    )
     both = (asked + asked).scaled(0.5).with_density_unit(3.0)
     torch.testing.assert_close(both.face_steps.decrease(), asked.face_steps.decrease())
 

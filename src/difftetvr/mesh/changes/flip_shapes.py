@@ -65,8 +65,8 @@ class FlipJudge:
         return self._flips(candidates, rows, [column.index_select(0, rows) for column in numbers])
 
     def _source(self) -> _Shapes:
-        floats = map(self._backend.floats, (self.points, *self._shapes))
-        return _Shapes(self._backend, *floats, self._backend.opaque(self._min_quality))
+        points, determinants, qualities = map(self._backend.floats, (self.points, *self._shapes))
+        return _Shapes(self._backend, points, determinants, qualities, self._backend.opaque(self._min_quality))
 
     def _flips(self, candidates: FlipCandidates, rows: torch.Tensor, numbers: list[torch.Tensor]) -> Flips:
         parts = (candidates.vanishes, candidates.cells, candidates.edge, candidates.ring)
