@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import torch
 
+from difftetvr.backend import Backend, get_backend
 from difftetvr.errors import FitError
 from difftetvr.fitting.motion import VertexOptimizerConfig
 from difftetvr.mesh.boundary import BoundaryConstraint
 from difftetvr.mesh.changes.change import MeshChange
 from difftetvr.mesh.motion import cap_move, guard_move
-from difftetvr.mesh.shapes import VertexShapes, measure_vertices
+from difftetvr.mesh.shapes import VertexShapes, dot, measure_vertices
 from difftetvr.mesh.tetmesh import TetMesh
+from difftetvr.recording import replayed
 
 _WALL_START = 2.5
 """Where the wall begins, in units of the guard's floor of Q."""
@@ -114,11 +117,11 @@ class VertexOptimizer:
         gradient = self._finite_gradient()
         old = self.mesh.vertices.detach()
         shapes = measure_vertices(self.mesh, self._barrier)
-        move = self._proposal(gradient, shapes, rate)
-        move, capped = cap_move(self._boundary.apply(old, move), shapes.altitudes, self.config.cap)
+        move, altitudes = self._proposal(gradient, shapes, rate)
+        move, capped = cap_move(self._boundary.apply(old, move), altitudes, self.config.cap)
         guarded = guard_move(self.mesh, move, self.config.limits, shapes.cells)
+        moved = functools.reduce(torch.logical_or, (guarded.vertices != old).unbind(1)).sum()
         self.mesh = self.mesh.with_vertices(guarded.vertices.requires_grad_())
-        moved = (guarded.vertices.detach() != old).any(1).sum()
         return torch.stack((moved, capped, guarded.halved, guarded.refused))
 
     def carry(self, change: MeshChange) -> None:
@@ -188,30 +191,38 @@ class VertexOptimizer:
         return self._constraint
 
     def _finite_gradient(self) -> torch.Tensor:
-        """(V, 3) float64."""
+        """(V, 3)."""
         gradient = self.mesh.vertices.grad
         if gradient is None:
             raise FitError("No gradient has reached the vertices; call backward() on a rendering of optimizer.mesh.")
-        finite = torch.isfinite(gradient).all(1)
+        finite = torch.isfinite(gradient)
         if not finite.all():
             vertex = int(torch.nonzero(~finite)[0, 0])
             raise FitError(f"The gradient of vertex {vertex} is {gradient[vertex].tolist()}; make the loss finite.")
-        return gradient.double()
+        return gradient
 
-    def _proposal(self, gradient: torch.Tensor, shapes: VertexShapes, rate: float) -> torch.Tensor:
-        """(V, 3) float64 moves that loss and barrier ask for; advances the moments."""
-        decay, decay_of_squares = self.config.betas
-        altitudes = shapes.altitudes[:, None]
-        scaled = altitudes * gradient
+    def _proposal(self, gradient: torch.Tensor, shapes: VertexShapes, rate: float) -> tuple[torch.Tensor, torch.Tensor]:
+        """(V, 3) float64 moves that loss and barrier ask for, and (V,) altitudes; advances the moments."""
         self.steps += 1
-        self._first = torch.lerp(scaled, self._first, decay)
-        self._second = torch.lerp(scaled.square().sum(1), self._second, decay_of_squares)
-        mean = self._first / (1.0 - decay**self.steps)
-        length = (self._second / (1.0 - decay_of_squares**self.steps)).sqrt()[:, None]
-        # Where no gradient has ever been, moments are exactly zero: no epsilon, which would have the loss's unit.
-        move = torch.where(length > 0, -rate * altitudes * mean / length, 0.0)
-        pull = rate * altitudes.square() * shapes.barrier_gradient
-        return move - torch.where(torch.isfinite(pull), pull, 0.0)
+        if not len(gradient):
+            return self._first, self._second
+        backend = get_backend(str(gradient.device), torch.float64)
+        with backend.exclusive():
+            moments = _Moments(
+                backend,
+                backend.at(gradient.dtype).floats(gradient),
+                backend.floats(self._first),
+                backend.floats(self._second),
+                backend.floats(shapes.sums),
+                backend.floats(shapes.cells.scale),
+                [backend.constant(beta) for beta in self.config.betas],
+            )
+            corrections = [1.0 / (1.0 - beta**self.steps) for beta in self.config.betas]
+            found = replayed(_propose, moments, *(backend.opaque(number) for number in (rate, *corrections)))
+            backend.run(found)
+            columns = [backend.tensor(column) for column in found]
+        self._first, self._second = torch.stack(columns[3:6], 1), columns[6]
+        return torch.stack(columns[:3], 1), columns[7]
 
     @property
     def _barrier(self) -> _Barrier:
@@ -236,3 +247,51 @@ class _Barrier:
         least = max((start - self.floor) / _WALL_STEEPNESS, torch.finfo(torch.float64).tiny)
         nearness = dr.fmax(start - quality, 0.0) / dr.fmax(quality - self.floor, least)
         return dr.fma(nearness, self.wall, self.everywhere)
+
+
+# ---- Kernels
+
+
+@dataclass
+class _Moments:
+    """What moves are made from, flat.
+
+    Attributes:
+        backend: Array types, float64.
+        gradient: (V, 3) of the loss, in the precision of the mesh.
+        first: (V, 3) means of gradients in units of the loss.
+        second: (V,) means of their squared lengths.
+        sums: (V, 4) see `VertexShapes`.
+        scale: (1,) unit of these.
+        decays: Of both moments, as device values.
+    """
+
+    backend: Backend
+    gradient: Any
+    first: Any
+    second: Any
+    sums: Any
+    scale: Any
+    decays: list[Any]
+
+
+def _propose(moments: _Moments, rate: Any, correction: Any, correction_of_squares: Any) -> list[Any]:
+    """Of each vertex three numbers for the move that loss and barrier ask for, three for the first moment, the second
+    moment, and the altitude."""
+    real, axes = moments.backend.Float, range(3)
+    vertex = dr.arange(moments.backend.UInt, dr.width(moments.second))
+    *pull, altitude = dr.gather(moments.backend.Float4, moments.sums, vertex)
+    # Comparisons with NaN are false: what cannot be computed has no altitude.
+    altitude = dr.select(dr.isfinite(altitude) & (altitude > 0.0), altitude / moments.scale, 0.0)
+    gradient = [real(dr.gather(type(moments.gradient), moments.gradient, dr.fma(vertex, 3, k))) for k in axes]
+    scaled = [altitude * g for g in gradient]
+    first = [dr.lerp(scaled[k], dr.gather(real, moments.first, dr.fma(vertex, 3, k)), moments.decays[0]) for k in axes]
+    second = dr.lerp(dot(scaled, scaled), moments.second, moments.decays[1])
+    # Where no gradient has ever been, moments are exactly zero: no epsilon, which would have the loss's unit.
+    length = dr.sqrt(second * correction_of_squares)
+    step = dr.select(length > 0.0, -rate * altitude * correction / length, 0.0)
+    push = rate * altitude * altitude * moments.scale
+    pull = [push * p for p in pull]
+    move = [dr.fma(step, first[k], dr.select(dr.isfinite(pull[k]), -pull[k], 0.0)) for k in axes]
+    dr.eval(move, first, second, altitude)
+    return [*move, *first, second, altitude]

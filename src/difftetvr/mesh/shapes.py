@@ -45,14 +45,26 @@ class VertexShapes:
     """What a step of the vertices has to know of the cells around them.
 
     Attributes:
-        altitudes: (V,) float64, the smallest altitude of all cells around each vertex, 0 where no cell uses it.
-        barrier_gradient: (V, 3) float64, gradient of the sum of -log Q over all cells, each with its weight.
+        sums: (V, 4) float64, gradient of the sum of -log Q over all cells, each with its weight, and the smallest
+            altitude of all cells around each vertex, in the scaled unit; where that is no positive number, there are
+            no cells, or it cannot be told.
         cells: Volumes and qualities.
     """
 
-    altitudes: torch.Tensor
-    barrier_gradient: torch.Tensor
+    sums: torch.Tensor
     cells: CellShapes
+
+    @property
+    def altitudes(self) -> torch.Tensor:
+        """(V,) float64, the smallest altitude of all cells around each vertex, 0 where no cell uses it."""
+        altitudes = self.sums[:, 3]
+        # Comparisons with NaN are false: what cannot be computed has no altitude.
+        return torch.where(torch.isfinite(altitudes) & (altitudes > 0), altitudes, 0.0) / self.cells.scale
+
+    @property
+    def barrier_gradient(self) -> torch.Tensor:
+        """(V, 3) float64, gradient of the sum of -log Q over all cells, each with its weight."""
+        return self.sums[:, :3] * self.cells.scale
 
 
 def length_scale(vertices: torch.Tensor) -> torch.Tensor:
@@ -102,7 +114,7 @@ def measure_cells(corners: torch.Tensor, points: torch.Tensor) -> tuple[torch.Te
         return points.new_empty(0), points.new_empty(0)
     backend = _backend(points)
     with backend.exclusive():
-        determinants, qualities = replayed(_measures, _source(backend, corners, points))
+        determinants, qualities = replayed(_measures, cell_source(backend, corners, points))
         return backend.tensor(determinants), backend.tensor(qualities)
 
 
@@ -122,36 +134,31 @@ def measure_vertices(mesh: TetMesh, weigh: Callable[[Any], Any] | None = None) -
     points = scaled_points(mesh.vertices, scale)
     if not topology.num_cells:
         nothing = points.new_empty(0)
-        return VertexShapes(
-            torch.zeros_like(points[:, 0]), torch.zeros_like(points[:, :3]), CellShapes(scale, nothing, nothing)
-        )
+        return VertexShapes(torch.zeros_like(points), CellShapes(scale, nothing, nothing))
     backend = _backend(points)
     with backend.exclusive():
-        source, length = _source(backend, corner_columns(topology), points), few_lengths(topology.num_cells)
+        source, length = cell_source(backend, corner_columns(topology), points), few_lengths(topology.num_cells)
         determinants, qualities, corners = replayed(_shapes, source, weigh, length)
         stars = StarSource.of(backend, topology, corners)
         sums = replayed(sums_of_stars, stars, few_lengths(topology.num_vertices), True)
         of_cells = CellShapes(scale, backend.tensor(determinants), backend.tensor(qualities))
-        of_vertices = backend.tensor(sums, -1, 4)[: topology.num_vertices]
-    altitudes = of_vertices[:, 3]
-    # Comparisons with NaN are false: what cannot be computed has no altitude.
-    altitudes = torch.where(torch.isfinite(altitudes) & (altitudes > 0), altitudes, 0.0)
-    return VertexShapes(altitudes / scale, of_vertices[:, :3] * scale, of_cells)
+        return VertexShapes(backend.tensor(sums, -1, 4)[: topology.num_vertices], of_cells)
 
 
 def _backend(points: torch.Tensor) -> Backend:
     return get_backend(str(points.device), torch.float64)
 
 
-def _source(backend: Backend, corners: torch.Tensor, points: torch.Tensor) -> _CellSource:
-    return _CellSource(backend, backend.floats(points), [backend.uints(column) for column in corners])
+def cell_source(backend: Backend, corners: torch.Tensor, points: torch.Tensor) -> CellSource:
+    """Cells as kernels read them: (4, N) int32 vertices, and (V, 4) float64 `scaled_points`."""
+    return CellSource(backend, backend.floats(points), [backend.uints(column) for column in corners])
 
 
 # ---- Kernels
 
 
 @dataclass
-class _CellSource:
+class CellSource:
     """Cells, flat.
 
     Attributes:
@@ -199,7 +206,7 @@ class StarSource:
         return StarSource(backend, first, end, around, corners)
 
 
-def _measures(source: _CellSource) -> tuple[Any, Any]:
+def _measures(source: CellSource) -> tuple[Any, Any]:
     """Determinants and qualities of cells, for :func:`difftetvr.recording.replayed`."""
     determinant, quality = measured(*source.edges())
     dr.eval(determinant, quality)
@@ -212,7 +219,7 @@ def measured(a: Vector, b: Vector, c: Vector) -> tuple[Any, Any]:
     return determinant, _quality(determinant, _squared_edges(a, b, c, _sum(a, b, c)))
 
 
-def _shapes(source: _CellSource, weigh: Callable[[Any], Any] | None, length: int) -> tuple[Any, Any, Any]:
+def _shapes(source: CellSource, weigh: Callable[[Any], Any] | None, length: int) -> tuple[Any, Any, Any]:
     """The same, and for each corner of a cell the gradient of -log Q and the cell's least altitude.
 
     Args:
