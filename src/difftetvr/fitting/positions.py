@@ -277,7 +277,8 @@ class _Moments:
 
 def _propose(moments: _Moments, rate: Any, correction: Any, correction_of_squares: Any) -> list[Any]:
     """Of each vertex three numbers for the move that loss and barrier ask for, three for the first moment, the second
-    moment, and the altitude."""
+    moment, and the altitude.
+    """
     real, axes = moments.backend.Float, range(3)
     vertex = dr.arange(moments.backend.UInt, dr.width(moments.second))
     *pull, altitude = dr.gather(moments.backend.Float4, moments.sums, vertex)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import torch
 
 from difftetvr.mesh.arrays import true_indices
@@ -11,7 +13,9 @@ from difftetvr.mesh.shapes import measure_cells
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.mesh.topology.incidence import find_edges
 from difftetvr.mesh.topology.lookup import are_faces
-from difftetvr.mesh.topology.rings import closed_rings
+from difftetvr.mesh.topology.rings import Rings, closed_rings
+
+_EDGES_AT_ONCE = 2**20
 
 
 def find_flips(mesh: TetMesh, *, min_quality: float = 0.1) -> Flips:
@@ -29,9 +33,12 @@ def find_flips(mesh: TetMesh, *, min_quality: float = 0.1) -> Flips:
         that vanish in `mesh.topology.edges`. An edge with four cells around it may have two 4-4 flips.
     """
     judge = FlipJudge(mesh, min_quality)
-    candidates = _across_faces(mesh, judge.good_faces()), _around_edges_of_three(mesh), _around_edges_of_four(judge)
-    flips = Flips.joined([judge.good(of_a_kind) for of_a_kind in candidates])
-    return flips.select(~_is_there(flips))
+    candidates = [
+        _across_faces(mesh, judge.good_faces()),
+        judge.good(_around_edges_of_three(mesh)),
+        *(judge.good(part) for part in _around_edges_of_four(judge)),
+    ]
+    return Flips.joined([judge.flips(of_a_kind.select(_is_new(mesh, of_a_kind))) for of_a_kind in candidates])
 
 
 def _across_faces(mesh: TetMesh, rows: torch.Tensor) -> FlipCandidates:
@@ -49,9 +56,14 @@ def _around_edges_of_three(mesh: TetMesh) -> FlipCandidates:
     return FlipCandidates(THREE_TO_TWO, rings.rows, rings.cells, rings.edge, rings.vertices)
 
 
-def _around_edges_of_four(judge: FlipJudge) -> FlipCandidates:
-    """4-4 flips of edges with four cells, to either diagonal of the ring."""
+def _around_edges_of_four(judge: FlipJudge) -> Iterator[FlipCandidates]:
+    """4-4 flips of edges with four cells, to either diagonal of the ring; a part at a time, as there are many."""
     rings = closed_rings(judge.mesh.topology, 4)
+    for first in range(0, len(rings.rows), _EDGES_AT_ONCE):
+        yield _around_some_of_four(judge, rings.part(slice(first, first + _EDGES_AT_ONCE)))
+
+
+def _around_some_of_four(judge: FlipJudge, rings: Rings) -> FlipCandidates:
     (u, v), (a, b, c, d) = rings.edge.unbind(1), rings.vertices.unbind(1)
     edge = torch.stack((a, c, b, d), 1).view(-1, 2)
     ring = torch.stack((v, b, u, d, v, c, u, a), 1).view(-1, 4)
@@ -65,11 +77,8 @@ def _around_edges_of_four(judge: FlipJudge) -> FlipCandidates:
     return FlipCandidates(FOUR_TO_FOUR, rings.rows.repeat_interleave(2), cells, edge, ring)
 
 
-def _is_there(flips: Flips) -> torch.Tensor:
-    """(N,) bool: the mesh has the edge or face already that a flip would make."""
-    topology = flips.mesh.topology
-    makes_face = flips.kind == THREE_TO_TWO
-    is_there = (find_edges(topology, flips.edge) >= 0) & ~makes_face
-    rows = true_indices(makes_face)
-    is_there[rows] = are_faces(topology, flips.ring.index_select(0, rows)[:, :3])
-    return is_there
+def _is_new(mesh: TetMesh, candidates: FlipCandidates) -> torch.Tensor:
+    """(M,) int64, those flips whose edge or face the mesh does not have already."""
+    if candidates.kind == THREE_TO_TWO:
+        return true_indices(~are_faces(mesh.topology, candidates.ring))
+    return true_indices(find_edges(mesh.topology, candidates.edge) < 0)

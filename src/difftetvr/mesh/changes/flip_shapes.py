@@ -30,6 +30,11 @@ class FlipCandidates:
     edge: torch.Tensor
     ring: torch.Tensor
 
+    def select(self, rows: torch.Tensor) -> FlipCandidates:
+        """Some of them, (M,) int64."""
+        parts = (self.vanishes, self.cells, self.edge, self.ring)
+        return FlipCandidates(self.kind, *(part.index_select(0, rows) for part in parts))
+
 
 class FlipJudge:
     """Tells which flips of a mesh leave good cells: of a quality that is high enough, or no worse than before."""
@@ -51,38 +56,45 @@ class FlipJudge:
             faces = _Faces(*(backend.uints(table) for table in tables))
             return true_indices(backend.tensor(replayed(_good_faces, self._source(), faces)) > 0)
 
-    def good(self, candidates: FlipCandidates) -> Flips:
+    def good(self, candidates: FlipCandidates) -> FlipCandidates:
         """Those candidates that leave good cells."""
-        backend, columns = self._backend, (candidates.cells, candidates.edge, candidates.ring)
-        if not candidates.cells.shape[0]:
-            return self._flips(candidates, candidates.cells[:, 0].long(), [self.points[:0, 0]] * 6)
+        if not len(candidates.vanishes):
+            return candidates
+        backend = self._backend
         with backend.exclusive():
-            cells, edge, ring = ([backend.uints(column) for column in c.t().contiguous()] for c in columns)
-            found = replayed(_judged, self._source(), candidates.kind, cells, edge, ring)
-            backend.run(found)
-            is_good, *numbers = (backend.tensor(column) for column in found)
-        rows = true_indices(is_good > 0)
-        return self._flips(candidates, rows, [column.index_select(0, rows) for column in numbers])
+            is_good = backend.tensor(replayed(_are_good, self._source(), _uploaded(backend, candidates)))
+        return candidates.select(true_indices(is_good > 0))
 
-    def _source(self) -> _Shapes:
-        points, determinants, qualities = map(self._backend.floats, (self.points, *self._shapes))
-        return _Shapes(self._backend, points, determinants, qualities, self._backend.opaque(self._min_quality))
-
-    def _flips(self, candidates: FlipCandidates, rows: torch.Tensor, numbers: list[torch.Tensor]) -> Flips:
-        parts = (candidates.vanishes, candidates.cells, candidates.edge, candidates.ring)
-        vanishes, cells, edge, ring = (part.index_select(0, rows) for part in parts)
+    def flips(self, candidates: FlipCandidates) -> Flips:
+        """Candidates that are possible, and what is to be known of them."""
+        backend, numbers = self._backend, [self.points[:0, 0]] * 6
+        if len(candidates.vanishes):
+            with backend.exclusive():
+                found = replayed(_described, self._source(), _uploaded(backend, candidates))
+                backend.run(found)
+                numbers = [backend.tensor(column) for column in found]
         return Flips(
             mesh=self.mesh,
-            kind=torch.full_like(vanishes, candidates.kind, dtype=torch.int8),
-            vanishes=vanishes,
-            cells=_filled(cells),
-            edge=edge,
-            ring=_filled(ring),
+            kind=torch.full_like(candidates.vanishes, candidates.kind, dtype=torch.int8),
+            vanishes=candidates.vanishes,
+            cells=_filled(candidates.cells),
+            edge=candidates.edge,
+            ring=_filled(candidates.ring),
             weight=numbers[0],
             face_weights=torch.stack(numbers[1:4], 1),
             quality_before=numbers[4],
             quality_after=numbers[5],
         )
+
+    def _source(self) -> _Shapes:
+        points, determinants, qualities = map(self._backend.floats, (self.points, *self._shapes))
+        return _Shapes(self._backend, points, determinants, qualities, self._backend.opaque(self._min_quality))
+
+
+def _uploaded(backend: Backend, candidates: FlipCandidates) -> _Flips:
+    columns = (candidates.cells, candidates.edge, candidates.ring)
+    cells, edge, ring = ([backend.uints(column) for column in part.t().contiguous()] for part in columns)
+    return _Flips(candidates.kind, cells, edge, ring)
 
 
 def _filled(indices: torch.Tensor) -> torch.Tensor:
@@ -140,6 +152,16 @@ class _Faces:
     tets: Any
 
 
+@dataclass
+class _Flips:
+    """Flips of one kind, a column for each of their cells, ends and vertices around, see `Flips`."""
+
+    kind: int
+    cells: list[Any]
+    edge: list[Any]
+    ring: list[Any]
+
+
 def _good_faces(shapes: _Shapes, faces: _Faces) -> Any:
     """1 for inner faces whose flip leaves good cells, 0 for others."""
     backend, is_inner = shapes.backend, faces.second != _NONE
@@ -157,14 +179,20 @@ def _good_faces(shapes: _Shapes, faces: _Faces) -> Any:
     return result
 
 
-def _judged(shapes: _Shapes, kind: int, cells: list[Any], edge: list[Any], ring: list[Any]) -> list[Any]:
-    """Whether flips leave good cells, `weight`, the `face_weights` and both qualities of `Flips`."""
-    backend = shapes.backend
-    determinants, after = _shapes_after(shapes, kind, edge, ring)
-    before = shapes.quality_before(cells)
-    old = [dr.gather(backend.Float, shapes.determinants, cell) for cell in cells]
-    is_good = dr.select(shapes.is_good(before, after), backend.Int(1), backend.Int(0))
-    result = [is_good, *_crossing(kind, old, determinants), before, after]
+def _are_good(shapes: _Shapes, flips: _Flips) -> Any:
+    """1 for flips that leave good cells, 0 for others."""
+    _, after = _shapes_after(shapes, flips.kind, flips.edge, flips.ring)
+    is_good = shapes.is_good(shapes.quality_before(flips.cells), after)
+    result = dr.select(is_good, shapes.backend.Int(1), shapes.backend.Int(0))
+    dr.eval(result)
+    return result
+
+
+def _described(shapes: _Shapes, flips: _Flips) -> list[Any]:
+    """`weight`, the `face_weights`, and both qualities of `Flips`."""
+    determinants, after = _shapes_after(shapes, flips.kind, flips.edge, flips.ring)
+    before = [dr.gather(shapes.backend.Float, shapes.determinants, cell) for cell in flips.cells]
+    result = [*_crossing(flips.kind, before, determinants), shapes.quality_before(flips.cells), after]
     dr.eval(result)
     return result
 

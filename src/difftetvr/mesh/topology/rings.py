@@ -40,6 +40,10 @@ class Rings:
     vertices: torch.Tensor
     cells: torch.Tensor
 
+    def part(self, which: slice) -> Rings:
+        """Some of them."""
+        return Rings(self.rows[which], self.edge[which], self.vertices[which], self.cells[which])
+
 
 def closed_rings(topology: Topology, size: int) -> Rings:
     """The inner edges that have a given number of cells around them, and what lies around them.
