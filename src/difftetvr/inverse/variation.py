@@ -17,8 +17,9 @@ import drjit as dr
 import torch
 
 from difftetvr.backend import Backend, get_backend
-from difftetvr.mesh.shapes import StarSource, corner_columns, cross, dot, sums_of_stars
+from difftetvr.mesh.shapes import StarSource, cross, dot, sums_of_stars
 from difftetvr.mesh.tetmesh import TetMesh
+from difftetvr.mesh.topology.incidence import corner_columns
 from difftetvr.recording import few_lengths, replayed
 
 

@@ -16,7 +16,6 @@ from difftetvr.mesh.shapes import (
     CellShapes,
     CellSource,
     cell_source,
-    corner_columns,
     dot,
     length_scale,
     measure_cells,
@@ -24,7 +23,7 @@ from difftetvr.mesh.shapes import (
     scaled_points,
 )
 from difftetvr.mesh.tetmesh import TetMesh
-from difftetvr.mesh.topology.incidence import stars
+from difftetvr.mesh.topology.incidence import corner_columns, stars
 from difftetvr.mesh.topology.topology import Topology
 from difftetvr.recording import replayed
 

@@ -16,6 +16,7 @@ import torch
 
 from difftetvr.backend import Backend, get_backend
 from difftetvr.mesh.tetmesh import TetMesh
+from difftetvr.mesh.topology.incidence import corner_columns
 from difftetvr.mesh.topology.topology import Topology
 from difftetvr.recording import few_lengths, replayed
 
@@ -93,11 +94,6 @@ def scaled_points(vertices: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
     points = vertices.new_zeros((vertices.shape[0], 4), dtype=torch.float64)
     points[:, :3] = vertices.detach().double() * scale
     return points
-
-
-def corner_columns(topology: Topology) -> torch.Tensor:
-    """The cells' vertex indices corner by corner, (4, T) int32 contiguous; built once for a topology."""
-    return topology.cached("mesh.shapes.corner_columns", lambda: topology.tets.t().contiguous())
 
 
 def measure_cells(corners: torch.Tensor, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -12,7 +12,9 @@ from hypothesis import strategies as st
 
 from difftetvr.mesh import TetMesh, Topology
 from difftetvr.mesh.topology import faces
-from difftetvr.mesh.topology.topology import LOCAL_FACES
+from difftetvr.mesh.topology.incidence import cell_edges, cell_faces, find_edges
+from difftetvr.mesh.topology.lookup import are_faces
+from difftetvr.mesh.topology.topology import LOCAL_EDGES, LOCAL_FACES
 
 
 def random_mesh(seed, count=40):
@@ -64,6 +66,36 @@ def test_tables_match_brute_force(mesh):
         assert cells[offsets[v] : offsets[v + 1]].tolist() == around
     for array in (topology.cell_adjacency, topology.faces, topology.face_cells, topology.edges, offsets, cells):
         assert array.dtype == torch.int32
+
+
+@properties
+@given(mesh=meshes, seed=st.integers(0, 2**32 - 1))
+def test_lookups_match_brute_force(mesh, seed):
+    topology, tets = mesh.topology, mesh.tets.tolist()
+    rows = {tuple(edge): row for row, edge in enumerate(topology.edges.tolist())}
+    expected = [[rows[tuple(sorted((corners[i], corners[j])))] for i, j in LOCAL_EDGES] for corners in tets]
+    assert cell_edges(topology).tolist() == expected
+
+    rows_of_faces = {frozenset(face): row for row, face in enumerate(topology.faces.tolist())}
+    expected = [[rows_of_faces[frozenset(corners[i] for i in local)] for local in LOCAL_FACES] for corners in tets]
+    assert cell_faces(topology).tolist() == expected
+
+    pairs = torch.randint(mesh.num_vertices, (200, 2), generator=torch.Generator().manual_seed(seed))
+    pairs = torch.cat((pairs, topology.edges.flip(1)))
+    assert find_edges(topology, pairs).tolist() == [rows.get(tuple(sorted(pair)), -1) for pair in pairs.tolist()]
+
+    triples = torch.rand((200, mesh.num_vertices), generator=torch.Generator().manual_seed(seed)).argsort(1)[:, :3]
+    triples = torch.cat((triples.int(), topology.faces.roll(1, 1)))
+    assert are_faces(topology, triples).tolist() == [frozenset(t) in rows_of_faces for t in triples.tolist()]
+
+
+def test_lookups_around_a_vertex_of_many_loose_cells():
+    none = torch.empty((0, 3), dtype=torch.int32)
+    fan = Topology(torch.tensor([[0, 1 + k, 2 + k, 3 + k] for k in range(300)], dtype=torch.int32), 310)
+    found = find_edges(fan, torch.tensor([[302, 0], [0, 303], [7, 5], [309, 0]])) >= 0
+    assert found.tolist() == [True, False, True, False]
+    assert fan.edges[find_edges(fan, fan.edges.flip(1))].equal(fan.edges)
+    assert not find_edges(fan, none[:, :2]).numel() and not are_faces(fan, none).numel()
 
 
 @properties

@@ -12,8 +12,9 @@ from difftetvr.backend import Backend, get_backend
 from difftetvr.mesh import quality
 from difftetvr.mesh.arrays import true_indices
 from difftetvr.mesh.changes.flips import FOUR_TO_FOUR, THREE_TO_TWO, TWO_TO_THREE, Flips, cells_after
-from difftetvr.mesh.shapes import Vector, corner_columns, length_scale, measure_cells, measured, scaled_points
+from difftetvr.mesh.shapes import Vector, length_scale, measure_cells, measured, scaled_points
 from difftetvr.mesh.tetmesh import TetMesh
+from difftetvr.mesh.topology.incidence import corner_columns
 from difftetvr.recording import replayed
 
 _NONE = 0xFFFFFFFF
@@ -50,8 +51,6 @@ class FlipJudge:
         """(N,) int64 the inner faces whose 2-3 flips leave good cells, as indices into `mesh.topology.faces`."""
         topology, backend = self.mesh.topology, self._backend
         tables = topology.face_cells[:, 1].contiguous(), topology.face_cells, topology.faces, topology.tets
-        if not topology.faces.shape[0]:
-            return true_indices(tables[0] >= 0)
         with backend.exclusive():
             faces = _Faces(*(backend.uints(table) for table in tables))
             return true_indices(backend.tensor(replayed(_good_faces, self._source(), faces)) > 0)

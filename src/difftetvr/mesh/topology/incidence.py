@@ -6,7 +6,7 @@ import torch
 
 from difftetvr.errors import MeshError
 from difftetvr.mesh.topology.lookup import EdgeRows, edges_of_cells, faces_of_cells, places_of_edges
-from difftetvr.mesh.topology.topology import LOCAL_EDGES, Topology
+from difftetvr.mesh.topology.topology import Topology
 
 
 def cell_edges(topology: Topology) -> torch.Tensor:
@@ -18,7 +18,14 @@ def cell_edges(topology: Topology) -> torch.Tensor:
     Returns:
         (T, 6) int32 indices into `topology.edges`, in the order of `LOCAL_EDGES`.
     """
-    return topology.cached("incidence.cell_edges", lambda: _build_cell_edges(topology))
+    return topology.cached(
+        "incidence.cell_edges", lambda: edges_of_cells(_edge_rows(topology), corner_columns(topology))
+    )
+
+
+def corner_columns(topology: Topology) -> torch.Tensor:
+    """The cells' vertex indices corner by corner, (4, T) int32 contiguous; built once and kept with the topology."""
+    return topology.cached("incidence.corner_columns", lambda: topology.tets.t().contiguous())
 
 
 def cells_per_edge(topology: Topology) -> torch.Tensor:
@@ -45,7 +52,7 @@ def cell_faces(topology: Topology) -> torch.Tensor:
     Returns:
         (T, 4) int32 indices into `topology.faces`, of the face opposite local vertex k.
     """
-    return topology.cached("incidence.cell_faces", lambda: _build_cell_faces(topology))
+    return topology.cached("incidence.cell_faces", lambda: faces_of_cells(topology.cell_adjacency))
 
 
 def find_edges(topology: Topology, ends: torch.Tensor) -> torch.Tensor:
@@ -58,8 +65,8 @@ def find_edges(topology: Topology, ends: torch.Tensor) -> torch.Tensor:
     Returns:
         (N,) int64 indices into `topology.edges`, -1 where two vertices share no edge.
     """
-    if not topology.edges.shape[0] or not ends.shape[0]:
-        return torch.full_like(ends[:, 0], -1)
+    if not ends.shape[0]:
+        return ends[:, 0].long()
     return places_of_edges(_edge_rows(topology), *ends.unbind(1)).long()
 
 
@@ -161,13 +168,3 @@ def _build_edge_rows(topology: Topology) -> EdgeRows:
     lower, higher = topology.edges.unbind(1)
     counts = torch.bincount(lower, minlength=topology.num_vertices)
     return EdgeRows(torch.nn.functional.pad(counts.cumsum(0), (1, 0)).int(), higher.contiguous())
-
-
-def _build_cell_faces(topology: Topology) -> torch.Tensor:
-    return faces_of_cells(topology.cell_adjacency) if topology.num_cells else topology.tets
-
-
-def _build_cell_edges(topology: Topology) -> torch.Tensor:
-    if not topology.num_cells:
-        return topology.tets.new_empty((0, len(LOCAL_EDGES)))
-    return edges_of_cells(_edge_rows(topology), topology.tets.t().contiguous())

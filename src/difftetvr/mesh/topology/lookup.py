@@ -22,7 +22,7 @@ class EdgeRows:
 
     Attributes:
         offsets: (V + 1,) int32, where rows begin.
-        higher: (E,) int32, at least one.
+        higher: (E,) int32.
     """
 
     offsets: torch.Tensor
@@ -41,7 +41,7 @@ def edges_of_cells(rows: EdgeRows, corners: torch.Tensor) -> torch.Tensor:
 
     Args:
         rows: All edges there are.
-        corners: (4, T) int32 vertices of the cells, not of none.
+        corners: (4, T) int32 vertices of the cells.
     """
     backend = _backend(corners)
     with backend.exclusive():
@@ -54,7 +54,7 @@ def faces_of_cells(adjacency: torch.Tensor) -> torch.Tensor:
     """(T, 4) int32 faces of cells, numbered in the order of the cells that they are first of.
 
     Args:
-        adjacency: (T, 4) int32 neighbours, see :class:`difftetvr.mesh.Topology`; not of none.
+        adjacency: (T, 4) int32 neighbours, see :class:`difftetvr.mesh.Topology`.
     """
     backend = _backend(adjacency)
     with backend.exclusive():
