@@ -15,10 +15,8 @@ from difftetvr.mesh.changes.flips import FOUR_TO_FOUR, THREE_TO_TWO, TWO_TO_THRE
 from difftetvr.mesh.shapes import Vector, length_scale, measure_cells, measured, scaled_points
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.mesh.topology.incidence import corner_columns
+from difftetvr.mesh.topology.lookup import NONE
 from difftetvr.recording import replayed
-
-_NONE = 0xFFFFFFFF
-"""-1 in kernels."""
 
 
 @dataclass(frozen=True)
@@ -163,7 +161,7 @@ class _Flips:
 
 def _good_faces(shapes: _Shapes, faces: _Faces) -> Any:
     """1 for inner faces whose flip leaves good cells, 0 for others."""
-    backend, is_inner = shapes.backend, faces.second != _NONE
+    backend, is_inner = shapes.backend, faces.second != NONE
     face = dr.arange(backend.UInt, dr.width(faces.second))
     ring = [dr.gather(backend.UInt, faces.corners, 3 * face + k, is_inner) for k in range(3)]
     cells = list(dr.gather(backend.UInt2, faces.cells, face, is_inner))

@@ -12,7 +12,7 @@ from difftetvr.backend import Backend, get_backend
 from difftetvr.mesh.topology.topology import LOCAL_EDGES, Topology
 from difftetvr.recording import replayed
 
-_NONE = 0xFFFFFFFF
+NONE = 0xFFFFFFFF
 """-1 in kernels."""
 
 
@@ -113,7 +113,7 @@ class _Rows:
 
         place, _ = dr.while_loop((first, count), lambda _, left: left > 1, halve)
         is_there = (count > 0) & (dr.gather(uint, self.higher, place, count > 0) == high)
-        return dr.select(is_there, place, _NONE)
+        return dr.select(is_there, place, NONE)
 
 
 def _places(rows: _Rows, one: Any, other: Any) -> Any:

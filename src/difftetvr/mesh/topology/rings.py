@@ -11,6 +11,7 @@ import torch
 from difftetvr.backend import Backend, get_backend
 from difftetvr.mesh.arrays import constant, true_indices
 from difftetvr.mesh.topology.incidence import cell_edges, cells_per_edge
+from difftetvr.mesh.topology.lookup import NONE
 from difftetvr.mesh.topology.topology import LOCAL_EDGES, Topology
 from difftetvr.recording import few_lengths, replayed
 
@@ -18,8 +19,6 @@ _OTHER_CORNERS = ((2, 3), (3, 1), (1, 2), (0, 3), (2, 0), (0, 1))
 """For each of `LOCAL_EDGES` i, j the other corners x, y, such that x, y, i, j is an even permutation."""
 
 _PATTERNS = tuple((*others, *edge) for others, edge in zip(_OTHER_CORNERS, LOCAL_EDGES, strict=True))
-_NONE = 0xFFFFFFFF
-"""-1 in kernels."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +107,7 @@ class _Fans:
 
 
 def _lowest_places(backend: Backend, table: Any, length: int) -> Any:
-    result = dr.full(backend.UInt, _NONE, length)
+    result = dr.full(backend.UInt, NONE, length)
     dr.scatter_reduce(dr.ReduceOp.Min, result, dr.arange(backend.UInt, dr.width(table)), table)
     result = backend.Int(result)
     dr.eval(result)
@@ -131,7 +130,7 @@ def _walk(fans: _Fans, size: int) -> list[Any]:
         for k in range(1, 4):
             across = dr.select(corners[k] == behind, k, across)
         cell = dr.gather(uint, fans.adjacency, 4 * cell + across, is_closed)
-        is_closed &= cell != _NONE
+        is_closed &= cell != NONE
         corners = dr.gather(fans.backend.UInt4, fans.tets, cell, is_closed)
         behind, vertex = vertex, corners[0] + corners[1] + corners[2] + corners[3] - vertex - i - j
         if step < size - 1:
