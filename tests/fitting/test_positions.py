@@ -118,6 +118,15 @@ def test_any_unit_of_length_and_of_the_loss(scale):
     torch.testing.assert_close(scaled.mesh.vertices / scale, plain.mesh.vertices, rtol=0, atol=1e-12)
 
 
+def test_the_shortest_gradients_move_vertices_as_far():
+    """Numbers below 1e-38 are 0 to kernels of float32; enough vertices that several threads take part."""
+    mesh = TetMesh.grid((30, 30, 30))
+    push = torch.randn(mesh.vertices.shape, generator=torch.Generator().manual_seed(0))
+    plain, tiny = (VertexOptimizer(mesh, VertexOptimizerConfig(barrier=0.0)) for _ in range(2))
+    assert step_with(plain, push).moved == step_with(tiny, push * 1e-39).moved > 0.8 * mesh.num_vertices
+    torch.testing.assert_close(tiny.mesh.vertices, plain.mesh.vertices, rtol=0, atol=1e-5)
+
+
 @properties
 @given(seed=seeds, boundary=boundaries)
 def test_steps_turn_with_the_mesh(seed, boundary):

@@ -279,6 +279,7 @@ def test_one_origin_serves_all_directions() -> None:
         ((torch.rand(4, 3), torch.rand(5, 3)), "do not fit together"),
         ((torch.rand(4, 3), torch.rand(4, 3), 2.0, 1.0), "Ray 0 is looked at from 2.0 to 1.0"),
         ((torch.rand(4, 3), torch.rand(4, 3), math.nan), "Ray 0 is looked at from nan"),
+        ((torch.rand(4, 3), torch.rand(4, 3), 1e39), "Ray 0 is looked at from inf to inf"),
         ((torch.rand(4, 3), torch.rand(4, 3), torch.zeros(3)), "do not fit together"),
         ((torch.rand(4, 3), "forwards"), "directions is 'forwards'"),
     ],
@@ -287,6 +288,11 @@ def test_mistakes_get_one_sentence(arguments: tuple[Any, ...], message: str) -> 
     with pytest.raises(CameraError, match=message) as error:
         Rays(*arguments)
     assert "\n" not in str(error.value)
+
+
+def test_numbers_are_compared_in_the_precision_of_rays() -> None:
+    bundle = Rays(torch.rand(4, 3), torch.rand(4, 3), near=1.0000000001, far=1.0)
+    assert torch.equal(*bundle.ends) and Rays(torch.rand(4, 3), torch.rand(4, 3), 0.0, 1e39).ends[1].isinf().all()
 
 
 def test_rays_have_no_common_order_of_cells() -> None:

@@ -210,7 +210,7 @@ class VertexOptimizer:
         with backend.exclusive():
             moments = _Moments(
                 backend,
-                backend.at(gradient.dtype).floats(gradient),
+                backend.floats(gradient),  # which PyTorch widens: kernels take the shortest numbers of float32 for 0
                 backend.floats(self._first),
                 backend.floats(self._second),
                 backend.floats(shapes.sums),
@@ -258,7 +258,7 @@ class _Moments:
 
     Attributes:
         backend: Array types, float64.
-        gradient: (V, 3) of the loss, in the precision of the mesh.
+        gradient: (V, 3) of the loss.
         first: (V, 3) means of gradients in units of the loss.
         second: (V,) means of their squared lengths.
         sums: (V, 4) see `VertexShapes`.
@@ -284,7 +284,7 @@ def _propose(moments: _Moments, rate: Any, correction: Any, correction_of_square
     *pull, altitude = dr.gather(moments.backend.Float4, moments.sums, vertex)
     # Comparisons with NaN are false: what cannot be computed has no altitude.
     altitude = dr.select(dr.isfinite(altitude) & (altitude > 0.0), altitude / moments.scale, 0.0)
-    gradient = [real(dr.gather(type(moments.gradient), moments.gradient, dr.fma(vertex, 3, k))) for k in axes]
+    gradient = [dr.gather(real, moments.gradient, dr.fma(vertex, 3, k)) for k in axes]
     scaled = [altitude * g for g in gradient]
     first = [dr.lerp(scaled[k], dr.gather(real, moments.first, dr.fma(vertex, 3, k)), moments.decays[0]) for k in axes]
     second = dr.lerp(dot(scaled, scaled), moments.second, moments.decays[1])

@@ -25,7 +25,7 @@ from difftetvr.mesh.shapes import (
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.mesh.topology.incidence import corner_columns, stars
 from difftetvr.mesh.topology.topology import Topology
-from difftetvr.recording import replayed
+from difftetvr.recording import eager, replayed
 
 _CERTAIN_QUALITY = 1e-13
 """Above this, rounding cannot have changed the sign of a volume: its error is below 4.6e-14 in units of Q."""
@@ -68,6 +68,7 @@ def measure(mesh: TetMesh) -> CellShapes:
     return CellShapes(scale, *measure_cells(corner_columns(mesh.topology), scaled_points(mesh.vertices, scale)))
 
 
+@eager
 def cap_move(move: torch.Tensor, altitudes: torch.Tensor, fraction: float) -> tuple[torch.Tensor, torch.Tensor]:
     """Shortens moves that are longer than a fraction of the smallest altitude around their vertex.
 
@@ -89,6 +90,7 @@ def cap_move(move: torch.Tensor, altitudes: torch.Tensor, fraction: float) -> tu
     return torch.stack(columns, 1).to(move.dtype), is_capped.sum()
 
 
+@eager
 def guard_move(
     mesh: TetMesh, move: torch.Tensor, limits: MotionLimits | None = None, before: CellShapes | None = None
 ) -> GuardedMove:
@@ -151,11 +153,11 @@ def _bad_cells(
     corners, old = corner_columns(topology), (before.determinants, before.qualities)
     if cells is not None:
         corners, old = corners.index_select(1, cells), (old[0][cells], old[1][cells])
-    if not corners.shape[1]:
-        return true_indices(old[0] > 0)
+    if cells is not None and not cells.shape[0]:
+        return cells
     backend = get_backend(str(points.device), torch.float64)
-    floors = backend.constant(float(limits.volume_ratio)), backend.constant(float(limits.quality))
     with backend.exclusive():
+        floors = backend.constant(float(limits.volume_ratio)), backend.constant(float(limits.quality))
         source = cell_source(backend, corners, points)
         is_bad = backend.tensor(replayed(_are_bad, source, *map(backend.floats, old), *floors))
     bad = true_indices(is_bad > 0)

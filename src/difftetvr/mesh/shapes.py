@@ -18,7 +18,7 @@ from difftetvr.backend import Backend, get_backend
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.mesh.topology.incidence import corner_columns
 from difftetvr.mesh.topology.topology import Topology
-from difftetvr.recording import few_lengths, replayed
+from difftetvr.recording import eager, few_lengths, replayed
 
 _QUALITY_FACTOR = math.sqrt(432.0)
 """Q = sqrt(432) det / S^(3/2), S the sum of the squared edge lengths: the same as 6 sqrt(2) V / l_rms^3."""
@@ -96,6 +96,7 @@ def scaled_points(vertices: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
     return points
 
 
+@eager
 def measure_cells(corners: torch.Tensor, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Determinants and qualities of cells; equal positions give equal bits.
 
@@ -114,6 +115,7 @@ def measure_cells(corners: torch.Tensor, points: torch.Tensor) -> tuple[torch.Te
         return backend.tensor(determinants), backend.tensor(qualities)
 
 
+@eager
 def measure_vertices(mesh: TetMesh, weigh: Callable[[Any], Any] | None = None) -> VertexShapes:
     """Altitudes, gradient of the shape barrier, volumes and qualities of a mesh.
 

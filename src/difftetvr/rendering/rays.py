@@ -92,7 +92,8 @@ class Rays:
     def _is_sound(self) -> bool:
         """Whether all rays are sound, without a look at which: in a fraction of that time."""
         directions = self.directions.detach()
-        are_ordered = torch.as_tensor(_are_ordered(self.near, self.far)).all()
+        near, far = (end if isinstance(end, torch.Tensor) else self._rounded(end) for end in (self.near, self.far))
+        are_ordered = torch.as_tensor(_are_ordered(near, far)).all()
         x, y, z = directions.unbind(-1)
         is_any_zero = ((x == 0) & (y == 0) & (z == 0)).any()
         finite = [torch.isfinite(end) for part in (self._starts.detach(), directions) for end in torch.aminmax(part)]
@@ -102,10 +103,16 @@ class Rays:
     def ends(self) -> tuple[torch.Tensor, torch.Tensor]:
         """``near`` and ``far`` as (...) tensors."""
         near, far = (
-            end if isinstance(end, torch.Tensor) else self.directions.new_full((), end).expand(self.shape)
+            end
+            if isinstance(end, torch.Tensor)
+            else self.directions.new_full((), self._rounded(end)).expand(self.shape)
             for end in (self.near, self.far)
         )
         return near, far
+
+    def _rounded(self, end: float) -> float:
+        """A number in the precision of the rays; infinite where that is none."""
+        return float(torch.tensor(end, dtype=self.directions.dtype))
 
     @property
     def shape(self) -> torch.Size:

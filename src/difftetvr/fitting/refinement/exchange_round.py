@@ -63,27 +63,27 @@ def _hats_of(mesh: TetMesh, values: torch.Tensor, may_bisect: torch.Tensor, flip
     """What has to be known: of edges that may be bisected, and of what flips would take away."""
     if flips is None:
         return HatChoice(may_bisect, values.new_zeros((mesh.topology.faces.shape[0], 4)))
-    edges = flips.all.vanishes[true_indices(takes_edge(flips.all))].long()
-    return HatChoice(may_bisect.index_fill(0, edges, True), face_steps(flips.all, flips.surplus))
+    edges = flips.possible.vanishes[true_indices(takes_edge(flips.possible))].long()
+    return HatChoice(may_bisect.index_fill(0, edges, True), face_steps(flips.possible, flips.surplus))
 
 
 @dataclass(frozen=True)
 class _Flips:
     """All possible flips of a mesh, and (N, 4) what they add to the parameters, see `Flips.surplus`."""
 
-    all: Flips
+    possible: Flips
     surplus: torch.Tensor
 
     @staticmethod
     def of(mesh: TetMesh, values: torch.Tensor, min_quality: float) -> _Flips:
         """Looks for them."""
         flips = find_flips(mesh, min_quality=min_quality)
-        return _Flips(flips, flips.surplus(values))
+        return _Flips(flips, flips.surplus(values.to(mesh.vertices.dtype)))  # the precision of models
 
     def worthwhile(self, gain: torch.Tensor, reach: float) -> tuple[Flips, torch.Tensor]:
         """Those that win something, with what they win; of changes that are too great nothing is known."""
         rows = true_indices((gain > 0) & (self.surplus.abs().amax(1) <= reach))
-        return self.all.select(rows), gain[rows]
+        return self.possible.select(rows), gain[rows]
 
 
 class _Round:
@@ -105,9 +105,9 @@ class _Round:
     def flip(self, flips: _Flips, model: ImageModel, target: int, options: Exchange) -> None:
         """Cut the same space otherwise where that fits the images better."""
         # A 2-3 flip makes a cell more, a 3-2 flip one less: one that a bisection could use.
-        kind = flips.all.kind
+        kind = flips.possible.kind
         cells = torch.where(kind == TWO_TO_THREE, 1, torch.where(kind == THREE_TO_TWO, -1, 0))
-        gain = flip_gains(flips.all, flips.surplus, model) - self._price_of_a_cell(options) * cells
+        gain = flip_gains(flips.possible, flips.surplus, model) - self._price_of_a_cell(options) * cells
         chosen = independent_flips(*flips.worthwhile(gain, self.reach))
         # What collapses cannot take away again must not be added.
         room = max(0, target - self.mesh.num_cells) + int(options.share * self.mesh.num_cells)

@@ -162,14 +162,15 @@ def flip_gains(flips: Flips, surplus: torch.Tensor, model: ImageModel) -> torch.
 
     Args:
         flips: Flips of the mesh that the model is of.
-        surplus: (N, 4) what they add to the parameters there, see `Flips.surplus`.
+        surplus: (N, 4) what they add to the parameters there, see `Flips.surplus`, in the model's precision.
         model: Derivatives.
 
     Returns:
         (N,) predicted decrease of the error.
     """
-    gain = model.edges.gradient.new_zeros(len(flips))
-    by_face, by_edge = (true_indices(mask) for mask in (~takes_edge(flips), takes_edge(flips)))
+    gain = torch.zeros_like(surplus[:, 0])
+    is_by_edge = takes_edge(flips)
+    by_face, by_edge = true_indices(~is_by_edge), true_indices(is_by_edge)
     faces, edges = flips.vanishes[by_face].long(), flips.vanishes[by_edge].long()
     if model.faces is None:
         assert model.face_steps is not None

@@ -14,10 +14,12 @@ from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.mesh.topology.incidence import find_edges
 from difftetvr.mesh.topology.lookup import are_faces
 from difftetvr.mesh.topology.rings import Rings, closed_rings
+from difftetvr.recording import eager
 
 _EDGES_AT_ONCE = 2**20
 
 
+@eager
 def find_flips(mesh: TetMesh, *, min_quality: float = 0.1) -> Flips:
     """All flips of a mesh that are possible.
 

@@ -10,7 +10,7 @@ import torch
 
 from difftetvr.backend import Backend, get_backend
 from difftetvr.mesh.topology.topology import LOCAL_EDGES, Topology
-from difftetvr.recording import replayed
+from difftetvr.recording import eager, replayed
 
 NONE = 0xFFFFFFFF
 """-1 in kernels."""
@@ -29,6 +29,7 @@ class EdgeRows:
     higher: torch.Tensor
 
 
+@eager
 def places_of_edges(rows: EdgeRows, one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
     """(N,) int32 places of edges between (N,) vertices, -1 where there is none; N is not 0."""
     backend = _backend(rows.higher)
@@ -36,6 +37,7 @@ def places_of_edges(rows: EdgeRows, one: torch.Tensor, other: torch.Tensor) -> t
         return backend.tensor(replayed(_places, _rows(backend, rows), backend.uints(one), backend.uints(other)))
 
 
+@eager
 def edges_of_cells(rows: EdgeRows, corners: torch.Tensor) -> torch.Tensor:
     """(T, 6) int32 places of the edges of cells, in the order of `LOCAL_EDGES`.
 
@@ -50,6 +52,7 @@ def edges_of_cells(rows: EdgeRows, corners: torch.Tensor) -> torch.Tensor:
         return torch.stack([backend.tensor(column) for column in found], 1)
 
 
+@eager
 def faces_of_cells(adjacency: torch.Tensor) -> torch.Tensor:
     """(T, 4) int32 faces of cells, numbered in the order of the cells that they are first of.
 
@@ -64,6 +67,7 @@ def faces_of_cells(adjacency: torch.Tensor) -> torch.Tensor:
         return backend.tensor(replayed(_faces_of_corners, backend, across, backend.uints(rank)), -1, 4)
 
 
+@eager
 def are_faces(topology: Topology, corners: torch.Tensor) -> torch.Tensor:
     """(N,) bool, whether some cell has three vertices together.
 

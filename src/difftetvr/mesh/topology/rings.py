@@ -13,7 +13,7 @@ from difftetvr.mesh.arrays import constant, true_indices
 from difftetvr.mesh.topology.incidence import cell_edges, cells_per_edge
 from difftetvr.mesh.topology.lookup import NONE
 from difftetvr.mesh.topology.topology import LOCAL_EDGES, Topology
-from difftetvr.recording import few_lengths, replayed
+from difftetvr.recording import eager, few_lengths, replayed
 
 _OTHER_CORNERS = ((2, 3), (3, 1), (1, 2), (0, 3), (2, 0), (0, 1))
 """For each of `LOCAL_EDGES` i, j the other corners x, y, such that x, y, i, j is an even permutation."""
@@ -25,7 +25,8 @@ _PATTERNS = tuple((*others, *edge) for others, edge in zip(_OTHER_CORNERS, LOCAL
 class Rings:
     """Inner edges that have so many cells around them, and what lies around them.
 
-    `vertices[k]`, `vertices[k + 1]` and the two of `edge` are the corners of `cells[k]`, positively oriented.
+    In each row the k-th and the next of `vertices` and the two of `edge` are the corners of the k-th of `cells`,
+    positively oriented.
 
     Attributes:
         rows: (N,) int32, the edges as indices into `topology.edges`, ascending.
@@ -44,6 +45,7 @@ class Rings:
         return Rings(self.rows[which], self.edge[which], self.vertices[which], self.cells[which])
 
 
+@eager
 def closed_rings(topology: Topology, size: int) -> Rings:
     """The inner edges that have a given number of cells around them, and what lies around them.
 
