@@ -61,7 +61,7 @@ def test_what_is_left_open_is_chosen_for_the_images(shiny: dtv.Capture) -> None:
     of_light = dtv.FitConfig().for_capture(light)
     assert (light.encoding, of_light.harmonics, of_light.density_rate, of_light.pace) == ("linear", 0, 1.0, 8.0)
     options = {"background": "white", "harmonics": 0, "cells": 500, "start": "grid", "iterations": 9}
-    given = dtv.FitConfig(**options, free_space=0.1, haze_penalty=0.0, density_rate=2.0, pace=3.0)
+    given = dtv.FitConfig(**options, free_space=0.1, density_rate=2.0, pace=3.0)
     assert given.for_capture(shiny) == given
     assert dtv.FitConfig.from_json(chosen.to_json()) == chosen
 
@@ -97,9 +97,7 @@ def test_nothing_is_put_before_the_cameras(room: dtv.Capture, start: str) -> Non
     options = FAST | {"cells": 3000, "iterations": 30, "start": start, "exchange": exchange}
     config = dtv.FitConfig(**options, harmonics=0, pace=1.0)  # few vertices come out or in within a step
     assert config.for_capture(capture).free_space == 0.8 and config.for_capture(room).free_space == 0.5
-    assert config.for_capture(capture).haze_penalty == 0.1 and config.for_capture(room).haze_penalty == 0.01
-    no_background = config.for_capture(dataclasses.replace(capture, surroundings=1.0))
-    assert no_background.free_space == 0.0 and no_background.haze_penalty == 0.01
+    assert config.for_capture(dataclasses.replace(capture, surroundings=1.0)).free_space == 0.0
     trainer = Trainer(capture, config)
     space = capture.free_space(0.8)
     for _ in range(30):

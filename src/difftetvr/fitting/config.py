@@ -44,7 +44,6 @@ _PHOTO_BANDS, _PHOTO_ITERATIONS = 2, 4800
 _CUT_OUT_DENSITY_RATE = 5.0  # what stands before a background would be put where it is seen first, and stay
 _PHOTO_PIXELS_PER_CELL = 12
 _FREE_BEFORE_POINTS, _FREE_BEFORE_BOUNDS = 0.8, 0.5
-_HAZE_PENALTY, _HAZE_PENALTY_AMONG_POINTS = 0.01, 0.1
 _MOST_PHOTO_CELLS = 1_000_000
 _BAND_SHARE = 0.05  # of the run, from one band of harmonics to the next
 _CHOICES_FOR_VOLUMES: dict[str, Any] = {
@@ -54,7 +53,6 @@ _CHOICES_FOR_VOLUMES: dict[str, Any] = {
     "background": "black",
     "harmonics": 0,
     "density_rate": 1.0,
-    "haze_penalty": _HAZE_PENALTY,
     "free_space": 0.0,
 }
 CHOSEN_FOR_CAPTURE = tuple(_CHOICES_FOR_VOLUMES)
@@ -122,10 +120,8 @@ class FitConfig(Schedule):
     background: Background | None = None
     """Behind the volume: black, white, random in every step (white where images are compared), or R G B. All but black
     need images with alpha. Default: random for photographs that alpha cuts out, else black."""
-    haze_penalty: float | None = None
-    """Pull towards zero density, in mean absolute density gradients; removes fog that no training view can refute.
-    Default: 0.1 for photographs with a background and sparse points, whose mesh has coarse cells around the cameras,
-    else 0.01."""
+    haze_penalty: float = 0.01
+    """Pull towards zero density, in mean absolute density gradients; removes fog that no training view can refute."""
     free_space: float | None = None
     """Share of the way from each training camera to the scene that is kept empty, in a cone wider than its view: to the
     capture's bounds, or to sparse points that are nearer. Default: for photographs with a background 0.8 where there
@@ -170,7 +166,7 @@ class FitConfig(Schedule):
             require(value is None or _positive(value), name, value, "greater than 0 and finite")
         for name in ("haze_penalty", "sparsity", "initial_density", "checkpoint_seconds"):
             value = getattr(self, name)
-            require(value is None or (value >= 0 and math.isfinite(value)), name, value, "at least 0 and finite")
+            require(value >= 0 and math.isfinite(value), name, value, "at least 0 and finite")
         require(0 <= self.initial_color <= 1, "initial_color", self.initial_color, "between 0 and 1")
         require(all(0 <= b < 1 for b in self.betas), "betas", self.betas, "at least 0 and less than 1")
         share = self.free_space
@@ -233,8 +229,6 @@ class FitConfig(Schedule):
         without_silhouettes = "grid" if capture.scene_points is None or self.grid is not None else "points"
         # Bounds alone do not say what else may stand before them.
         free_space = _FREE_BEFORE_BOUNDS if capture.scene_points is None else _FREE_BEFORE_POINTS
-        has_background = capture.surroundings > 1.0
-        is_among_points = has_background and capture.scene_points is not None
         return {
             "cells": max(_DEFAULT_CELLS, min(pixels // _PHOTO_PIXELS_PER_CELL, _MOST_PHOTO_CELLS)),
             "start": without_silhouettes if capture.silhouettes is None else "hull",
@@ -242,8 +236,7 @@ class FitConfig(Schedule):
             "background": "random" if capture.is_cut_out else "black",
             "harmonics": _PHOTO_BANDS,
             "density_rate": _CUT_OUT_DENSITY_RATE if capture.is_cut_out else 1.0,
-            "haze_penalty": _HAZE_PENALTY_AMONG_POINTS if is_among_points else _HAZE_PENALTY,
-            "free_space": free_space if has_background else 0.0,
+            "free_space": free_space if capture.surroundings > 1.0 else 0.0,
         }
 
     @property

@@ -133,7 +133,7 @@ class Trainer(AdaptiveRun):
         is_read = self._is_read()
         if is_read:
             self._unread.read_errors(self.history)
-        self.parameters.step(self.config.rate_at(self.iteration), self.config.haze_penalty or 0.0)
+        self.parameters.step(self.config.rate_at(self.iteration), self.config.haze_penalty)
         self._move(rate)
         if self.cameras is not None:
             self.cameras.step(batch, self.iteration / self.config.steps)
