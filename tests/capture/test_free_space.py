@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from difftetvr.capture.free_space import FreeSpace
 from difftetvr.capture.viewing import pose_of, positions_of
 from difftetvr.errors import CaptureError
+from difftetvr.mesh import TetMesh
 from difftetvr.rendering import Camera
 
 BOX = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
@@ -27,6 +28,16 @@ def test_it_reaches_a_share_of_the_way_to_the_box() -> None:
     z = torch.tensor([5.1, 4.9, 3.1, 2.9, 0.0])
     places = torch.stack((torch.zeros(5), torch.zeros(5), z), 1)
     assert space.contains(places).tolist() == [False, True, True, False, False]
+
+
+def test_cells_that_hold_some_of_it_are_empty_at_all_corners() -> None:
+    """One cell around the camera's tip, whose corners are all beside or behind, and one far away."""
+    space = FreeSpace.of([ASIDE], BOX, None, 0.5)
+    cell = torch.tensor([[18.0, 0.0, 1.0], [-9.0, 9.0, 1.0], [-9.0, -9.0, 1.0], [0.0, 0.0, 15.0]])
+    mesh = TetMesh(torch.cat((cell, cell + torch.tensor([0.0, 0.0, 40.0]))), [[0, 1, 2, 3], [4, 5, 6, 7]])
+    assert not space.contains(mesh.vertices).any()
+    assert space.vertices_of(mesh).tolist() == [True] * 4 + [False] * 4
+    assert not FreeSpace([], []).vertices_of(mesh).any()
 
 
 def test_points_before_a_camera_bring_its_end_nearer() -> None:

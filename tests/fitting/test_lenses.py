@@ -91,5 +91,5 @@ def test_no_vertex_is_put_before_the_cameras(barrel: dtv.Capture) -> None:
     trainer = Trainer(room, dtv.FitConfig(**options, harmonics=0, free_space=0.5, start="grid"))
     for _ in range(2):
         trainer.step()
-    is_free = room.free_space(0.5).contains(trainer.mesh.vertices)
+    is_free = room.free_space(0.5).vertices_of(trainer.mesh)
     assert bool(is_free.any()) and bool((trainer.parameters.detached_field().density[is_free] == 0.0).all())

@@ -10,7 +10,8 @@ import torch
 
 from difftetvr.capture.viewing import Floats, cell_centers, in_image, positions_of, project
 from difftetvr.errors import CaptureError
-from difftetvr.mesh.arrays import true_indices
+from difftetvr.mesh.arrays import chunks, true_indices
+from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.rendering.cameras.pinhole import Camera
 
 _NEAREST = 1.0  # percent of the points in a cone: fewer that are nearer are matched wrongly
@@ -63,6 +64,21 @@ class FreeSpace:
             away = torch.linalg.vector_norm(places - camera.position.to(places), dim=1)
             near = true_indices((away < reach) & ~found)
             found[near] = in_image(*camera.project(places[near]), camera, _margin(camera))
+        return found
+
+    def vertices_of(self, mesh: TetMesh) -> torch.Tensor:
+        """(V,) bool, which vertices of a mesh are in it, or belong to a cell whose centre is.
+
+        Cells are coarse around cameras, wider than a cone is at its tip: what a vertex beside it holds would reach in.
+        """
+        positions = mesh.vertices.detach()
+        found = self.contains(positions)
+        if not self.cameras:
+            return found
+        for part in chunks(mesh.num_cells, positions.device, width=12):
+            corners = mesh.tets[part].long()
+            within = true_indices(self.contains(positions[corners].mean(1)))
+            found[corners[within].view(-1)] = True
         return found
 
 

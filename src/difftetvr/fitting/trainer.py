@@ -92,7 +92,7 @@ class Trainer(AdaptiveRun):
         units = capture.density_units_at(self._sites())
         self.parameters = FieldParameters(self._mesh, config, units, start.field)
         self._free_space = capture.free_space(config.free_space or 0.0)
-        self.parameters.keep_free(self._free_space.contains(self._sites()))
+        self._keep_free()
         self.iteration = 0
         self.history = History()
         self._unread = Unread()
@@ -301,7 +301,10 @@ class Trainer(AdaptiveRun):
             self.parameters.add(refinement.surplus, self.capture.density_unit)
 
     def _keep_free(self) -> None:
-        self.parameters.keep_free(self._free_space.contains(self._sites()))  # also of those that have moved there
+        """Empties what is in free space now, also what has moved there."""
+        on_vertices = self.config.location == "vertex"
+        free = self._free_space
+        self.parameters.keep_free(free.vertices_of(self.mesh) if on_vertices else free.contains(self._sites()))
 
     def _color_gradients(self) -> torch.Tensor:
         return self._gradients.by_colors(self.mesh, self._train_views, self.iteration)
