@@ -150,11 +150,11 @@ def _bad_cells(
     topology: Topology, points: torch.Tensor, limits: MotionLimits, before: CellShapes, cells: torch.Tensor | None
 ) -> torch.Tensor:
     """Indices of the bad ones among some cells, None for all."""
+    if cells is not None and not cells.shape[0]:
+        return cells
     corners, old = corner_columns(topology), (before.determinants, before.qualities)
     if cells is not None:
         corners, old = corners.index_select(1, cells), (old[0][cells], old[1][cells])
-    if cells is not None and not cells.shape[0]:
-        return cells
     backend = get_backend(str(points.device), torch.float64)
     with backend.exclusive():
         floors = backend.constant(float(limits.volume_ratio)), backend.constant(float(limits.quality))
