@@ -32,6 +32,8 @@ _DEVICE_BACKENDS = {"cpu": "llvm", "cuda": "cuda", "mps": "metal"}
 _TURN = threading.RLock()
 _FORKED = threading.Event()  # set in copies of a process in which kernels had run
 _PACKET_BYTES = 16
+NONE = 0xFFFFFFFF
+"""What -1 of tables is in kernels, see :meth:`Backend.uints`: no cell, no half-face, no node of a list."""
 _DTYPES = {torch.float32: "", torch.float64: "64"}
 
 
@@ -89,7 +91,7 @@ class Backend:
         return self.Float(self._ready(tensor if tensor.dtype == self.dtype else tensor.to(self.dtype)))
 
     def uints(self, tensor: torch.Tensor) -> Any:
-        """Flat Dr.Jit view of an int32 tensor as unsigned integers, likewise: -1 becomes 0xFFFFFFFF."""
+        """Flat Dr.Jit view of an int32 tensor as unsigned integers, likewise: -1 becomes `NONE`."""
         ready = self._ready(tensor if tensor.dtype == torch.int32 else tensor.to(torch.int32))
         return self.UInt(ready.view(np.uint32 if self.name == "llvm" else torch.uint32))
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +11,7 @@ import torch
 from difftetvr.backend import Backend, get_backend
 from difftetvr.errors import FitError
 from difftetvr.fitting.motion import VertexOptimizerConfig
+from difftetvr.mesh.arrays import all_of_three
 from difftetvr.mesh.boundary import BoundaryConstraint
 from difftetvr.mesh.changes.change import MeshChange
 from difftetvr.mesh.motion import cap_move, guard_move
@@ -120,7 +120,7 @@ class VertexOptimizer:
         move, altitudes = self._proposal(gradient, shapes, rate)
         move, capped = cap_move(self._boundary.apply(old, move), altitudes, self.config.cap)
         guarded = guard_move(self.mesh, move, self.config.limits, shapes.cells)
-        moved = functools.reduce(torch.logical_or, (guarded.vertices != old).unbind(1)).sum()
+        moved = (~all_of_three(guarded.vertices == old)).sum()
         self.mesh = self.mesh.with_vertices(guarded.vertices.requires_grad_())
         return torch.stack((moved, capped, guarded.halved, guarded.refused))
 
@@ -282,8 +282,7 @@ def _propose(moments: _Moments, rate: Any, correction: Any, correction_of_square
     real, axes = moments.backend.Float, range(3)
     vertex = dr.arange(moments.backend.UInt, dr.width(moments.second))
     *pull, altitude = dr.gather(moments.backend.Float4, moments.sums, vertex)
-    # Comparisons with NaN are false: what cannot be computed has no altitude.
-    altitude = dr.select(dr.isfinite(altitude) & (altitude > 0.0), altitude / moments.scale, 0.0)
+    altitude = altitude / moments.scale
     gradient = [dr.gather(real, moments.gradient, dr.fma(vertex, 3, k)) for k in axes]
     scaled = [altitude * g for g in gradient]
     first = [dr.lerp(scaled[k], dr.gather(real, moments.first, dr.fma(vertex, 3, k)), moments.decays[0]) for k in axes]

@@ -47,8 +47,8 @@ class VertexShapes:
 
     Attributes:
         sums: (V, 4) float64, gradient of the sum of -log Q over all cells, each with its weight, and the smallest
-            altitude of all cells around each vertex, in the scaled unit; where that is no positive number, there are
-            no cells, or it cannot be told.
+            altitude of all cells around each vertex, in the scaled unit; 0 where no cell uses it, or where it cannot
+            be told.
         cells: Volumes and qualities.
     """
 
@@ -58,9 +58,7 @@ class VertexShapes:
     @property
     def altitudes(self) -> torch.Tensor:
         """(V,) float64, the smallest altitude of all cells around each vertex, 0 where no cell uses it."""
-        altitudes = self.sums[:, 3]
-        # Comparisons with NaN are false: what cannot be computed has no altitude.
-        return torch.where(torch.isfinite(altitudes) & (altitudes > 0), altitudes, 0.0) / self.cells.scale
+        return self.sums[:, 3] / self.cells.scale
 
     @property
     def barrier_gradient(self) -> torch.Tensor:
@@ -171,12 +169,9 @@ class CellSource:
 
     def edges(self) -> tuple[Vector, Vector, Vector]:
         """Edges from the first corner."""
-        first, *others = ([packet[k] for k in range(3)] for packet in map(self._packet, self.corners))
+        first, *others = (position(self.backend, self.points, corner) for corner in self.corners)
         a, b, c = ([x - y for x, y in zip(other, first, strict=True)] for other in others)
         return a, b, c
-
-    def _packet(self, corner: Any) -> Any:
-        return dr.gather(self.backend.Float4, self.points, corner)
 
 
 @dataclass
@@ -260,7 +255,7 @@ def sums_of_stars(source: StarSource, length: int, takes_least: bool) -> Any:
     Args:
         source: The cells around them.
         length: Number of vertices to make room for.
-        takes_least: Whether of the last of the four numbers the least counts, infinity where there are no cells.
+        takes_least: Whether of the last of the four numbers the least counts, 0 where that is not positive and finite.
 
     Returns:
         Flat (length, 4): sums in the order of the cells, but for such a least number.
@@ -276,10 +271,19 @@ def sums_of_stars(source: StarSource, length: int, takes_least: bool) -> Any:
     nothing = dr.full(backend.Float, dr.inf if takes_least else 0.0, lanes)
     begin = (source.first, [dr.zeros(backend.Float, lanes) for _ in range(3)], nothing)
     _, total, last = dr.while_loop(begin, lambda place, *_: place < source.end, add)
+    if takes_least:
+        # Comparisons with NaN are false, so what cannot be computed counts as nothing.
+        last = dr.select(dr.isfinite(last) & (last > 0.0), last, 0.0)
     result = dr.empty(backend.Float, 4 * length)
     dr.scatter(result, backend.Floats([*total, last]), vertex)
     dr.eval(result)
     return result
+
+
+def position(backend: Backend, points: Any, vertex: Any) -> Vector:
+    """Position of a vertex among (V, 4) flat ones, see `scaled_points`."""
+    packet = dr.gather(backend.Float4, points, vertex)
+    return [packet[k] for k in range(3)]
 
 
 def cross(p: Vector, q: Vector) -> Vector:

@@ -47,7 +47,7 @@ def exchange_cells(situation: Situation, target: int, options: Exchange) -> Refi
         options: How much of what.
     """
     mesh = situation.mesh
-    flips = _Flips.of(mesh, situation.values, options.min_quality) if options.flips else None
+    flips = _PossibleFlips.of(mesh, situation.values, options.min_quality) if options.flips else None
     may_bisect = long_edges(mesh, options.long)
     model = situation.model(_hats_of(mesh, situation.values, may_bisect, flips))
     exchange = _Round(situation, model, may_bisect, options)
@@ -59,7 +59,7 @@ def exchange_cells(situation: Situation, target: int, options: Exchange) -> Refi
     return exchange.refinement()
 
 
-def _hats_of(mesh: TetMesh, values: torch.Tensor, may_bisect: torch.Tensor, flips: _Flips | None) -> HatChoice:
+def _hats_of(mesh: TetMesh, values: torch.Tensor, may_bisect: torch.Tensor, flips: _PossibleFlips | None) -> HatChoice:
     """What has to be known: of edges that may be bisected, and of what flips would take away."""
     if flips is None:
         return HatChoice(may_bisect, values.new_zeros((mesh.topology.faces.shape[0], 4)))
@@ -68,17 +68,17 @@ def _hats_of(mesh: TetMesh, values: torch.Tensor, may_bisect: torch.Tensor, flip
 
 
 @dataclass(frozen=True)
-class _Flips:
+class _PossibleFlips:
     """All possible flips of a mesh, and (N, 4) what they add to the parameters, see `Flips.surplus`."""
 
     possible: Flips
     surplus: torch.Tensor
 
     @staticmethod
-    def of(mesh: TetMesh, values: torch.Tensor, min_quality: float) -> _Flips:
+    def of(mesh: TetMesh, values: torch.Tensor, min_quality: float) -> _PossibleFlips:
         """Looks for them."""
         flips = find_flips(mesh, min_quality=min_quality)
-        return _Flips(flips, flips.surplus(values.to(mesh.vertices.dtype)))  # the precision of models
+        return _PossibleFlips(flips, flips.surplus(values.to(mesh.vertices.dtype)))  # the precision of models
 
     def worthwhile(self, gain: torch.Tensor, reach: float) -> tuple[Flips, torch.Tensor]:
         """Those that win something, with what they win; of changes that are too great nothing is known."""
@@ -102,7 +102,7 @@ class _Round:
         self.predicted = 0.0
         self.flipped = 0
 
-    def flip(self, flips: _Flips, model: ImageModel, target: int, options: Exchange) -> None:
+    def flip(self, flips: _PossibleFlips, model: ImageModel, target: int, options: Exchange) -> None:
         """Cut the same space otherwise where that fits the images better."""
         # A 2-3 flip makes a cell more, a 3-2 flip one less: one that a bisection could use.
         kind = flips.possible.kind

@@ -14,8 +14,9 @@ from difftetvr.mesh.changes.change import MeshChange, check_indices, with_vertic
 from difftetvr.mesh.changes.collapse_shapes import keeps_shapes
 from difftetvr.mesh.changes.independent import BestFirst
 from difftetvr.mesh.tetmesh import TetMesh
-from difftetvr.mesh.topology.incidence import boundary_vertices, is_corner, stars
+from difftetvr.mesh.topology.incidence import boundary_vertices, stars
 from difftetvr.mesh.topology.link import link_condition
+from difftetvr.mesh.topology.lookup import is_corner
 from difftetvr.mesh.topology.topology import Topology
 
 _SMALLEST_BATCH = 2048

@@ -10,8 +10,9 @@ import torch
 
 from difftetvr.backend import Backend, get_backend
 from difftetvr.mesh import quality
-from difftetvr.mesh.shapes import length_scale, measured, scaled_points
+from difftetvr.mesh.shapes import length_scale, measured, position, scaled_points
 from difftetvr.mesh.tetmesh import TetMesh
+from difftetvr.mesh.topology.lookup import Stars, is_corner
 from difftetvr.recording import replayed
 
 
@@ -22,41 +23,35 @@ class Collapses:
     Attributes:
         backend: Array types, float64.
         removed, kept: (N,) vertices.
-        tets: (T, 4) vertices of cells.
-        offsets, cells: Cells around vertices, see :attr:`difftetvr.mesh.Topology.vertex_cells`.
+        stars: The cells around vertices.
         points: (V, 4) positions in a unit in which no product overflows, and padding.
     """
 
     backend: Backend
     removed: Any
     kept: Any
-    tets: Any
-    offsets: Any
-    cells: Any
+    stars: Stars
     points: Any
 
     @staticmethod
     def of(backend: Backend, mesh: TetMesh, removed: torch.Tensor, kept: torch.Tensor) -> Collapses:
         """Upload collapses of (N,) vertices into (N,) others."""
-        offsets, cells = mesh.topology.vertex_cells
         points = backend.floats(scaled_points(mesh.vertices, length_scale(mesh.vertices)))
-        tables = [backend.uints(table) for table in (removed, kept, mesh.tets, offsets, cells)]
-        return Collapses(backend, tables[0], tables[1], tables[2], tables[3], tables[4], points)
+        stars = Stars.of(backend, mesh.topology)
+        return Collapses(backend, backend.uints(removed), backend.uints(kept), stars, points)
 
     def star(self) -> tuple[Any, Any]:
         """First of the places that stand for the cells around the removed vertex, and the one behind the last."""
-        first, end = (dr.gather(self.backend.UInt, self.offsets, self.removed + k) for k in range(2))
-        return first, end
+        return self.stars.around(self.removed)
 
     def tet(self, place: Any) -> tuple[Any, Any]:
         """Vertices of the cell at a place, and whether it vanishes."""
-        tet = dr.gather(self.backend.UInt4, self.tets, dr.gather(self.backend.UInt, self.cells, place))
-        return tet, (tet[0] == self.kept) | (tet[1] == self.kept) | (tet[2] == self.kept) | (tet[3] == self.kept)
+        tet = self.stars.tet(place)
+        return tet, is_corner(tet, self.kept)
 
     def position(self, vertex: Any) -> list[Any]:
         """Position of a vertex."""
-        packet = dr.gather(self.backend.Float4, self.points, vertex)
-        return [packet[k] for k in range(3)]
+        return position(self.backend, self.points, vertex)
 
 
 def keeps_shapes(mesh: TetMesh, half_edges: torch.Tensor, min_quality: float) -> tuple[torch.Tensor, torch.Tensor]:

@@ -8,14 +8,13 @@ from typing import Any
 import drjit as dr
 import torch
 
-from difftetvr.backend import Backend, get_backend
+from difftetvr.backend import NONE, Backend, get_backend
 from difftetvr.mesh import quality
 from difftetvr.mesh.arrays import true_indices
 from difftetvr.mesh.changes.flips import FOUR_TO_FOUR, THREE_TO_TWO, TWO_TO_THREE, Flips, cells_after
-from difftetvr.mesh.shapes import Vector, length_scale, measure_cells, measured, scaled_points
+from difftetvr.mesh.shapes import Vector, length_scale, measure_cells, measured, position, scaled_points
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.mesh.topology.incidence import corner_columns
-from difftetvr.mesh.topology.lookup import NONE
 from difftetvr.recording import replayed
 
 
@@ -48,9 +47,9 @@ class FlipJudge:
     def good_faces(self) -> torch.Tensor:
         """(N,) int64 the inner faces whose 2-3 flips leave good cells, as indices into `mesh.topology.faces`."""
         topology, backend = self.mesh.topology, self._backend
-        tables = topology.face_cells[:, 1].contiguous(), topology.face_cells, topology.faces, topology.tets
         with backend.exclusive():
-            faces = _Faces(*(backend.uints(table) for table in tables))
+            cells = [backend.uints(column) for column in topology.face_cells.unbind(1)]
+            faces = _Faces(cells, backend.uints(topology.faces), backend.uints(topology.tets))
             return true_indices(backend.tensor(replayed(_good_faces, self._source(), faces)) > 0)
 
     def good(self, candidates: FlipCandidates) -> FlipCandidates:
@@ -120,8 +119,7 @@ class _Shapes:
 
     def position(self, vertex: Any) -> Vector:
         """Position of a vertex."""
-        packet = dr.gather(self.backend.Float4, self.points, vertex)
-        return [packet[k] for k in range(3)]
+        return position(self.backend, self.points, vertex)
 
     def quality_before(self, cells: list[Any]) -> Any:
         """Quality of the worst of some cells."""
@@ -137,14 +135,12 @@ class _Faces:
     """Faces and their cells, flat.
 
     Attributes:
-        second: (F,) the second cell of each face.
-        cells: (F, 2) both.
+        cells: (F,) the first cell of each face, and the second.
         corners: (F, 3) vertices.
         tets: (T, 4) vertices of cells.
     """
 
-    second: Any
-    cells: Any
+    cells: list[Any]
     corners: Any
     tets: Any
 
@@ -161,10 +157,10 @@ class _Flips:
 
 def _good_faces(shapes: _Shapes, faces: _Faces) -> Any:
     """1 for inner faces whose flip leaves good cells, 0 for others."""
-    backend, is_inner = shapes.backend, faces.second != NONE
-    face = dr.arange(backend.UInt, dr.width(faces.second))
+    backend, is_inner = shapes.backend, faces.cells[1] != NONE
+    face = dr.arange(backend.UInt, dr.width(is_inner))
     ring = [dr.gather(backend.UInt, faces.corners, 3 * face + k, is_inner) for k in range(3)]
-    cells = list(dr.gather(backend.UInt2, faces.cells, face, is_inner))
+    cells = [dr.select(is_inner, cell, 0) for cell in faces.cells]
     apexes = []
     for cell in cells:
         corners = dr.gather(backend.UInt4, faces.tets, cell, is_inner)

@@ -136,19 +136,6 @@ def stars(topology: Topology, vertices: torch.Tensor) -> tuple[torch.Tensor, tor
     return owner, cells.index_select(0, places).long()
 
 
-def is_corner(corners: torch.Tensor, vertices: torch.Tensor) -> torch.Tensor:
-    """Which cells have a vertex.
-
-    Args:
-        corners: (4, M) the cells' vertices: torch takes ten times as long to look through columns of four.
-        vertices: (M,) the vertex asked for in each cell.
-
-    Returns:
-        (M,) bool.
-    """
-    return (corners[0] == vertices) | (corners[1] == vertices) | (corners[2] == vertices) | (corners[3] == vertices)
-
-
 def _find_boundary_vertices(topology: Topology) -> torch.Tensor:
     mask = torch.zeros(topology.num_vertices, dtype=torch.bool, device=topology.tets.device)
     mask[topology.boundary_faces.view(-1).long()] = True

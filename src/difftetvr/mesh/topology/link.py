@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 
 from difftetvr.mesh.arrays import constant, sort_keys, true_indices
-from difftetvr.mesh.topology.incidence import boundary_vertices, find_edges, is_corner, shell, stars
+from difftetvr.mesh.topology.incidence import boundary_vertices, find_edges, shell, stars
+from difftetvr.mesh.topology.lookup import is_corner
 from difftetvr.mesh.topology.topology import LOCAL_FACES, Topology
 
 _PAIRS_AT_ONCE = 2**16

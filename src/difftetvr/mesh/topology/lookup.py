@@ -8,12 +8,9 @@ from typing import Any
 import drjit as dr
 import torch
 
-from difftetvr.backend import Backend, get_backend
+from difftetvr.backend import NONE, Backend, get_backend
 from difftetvr.mesh.topology.topology import LOCAL_EDGES, Topology
 from difftetvr.recording import eager, replayed
-
-NONE = 0xFFFFFFFF
-"""-1 in kernels."""
 
 
 @dataclass(frozen=True)
@@ -79,9 +76,22 @@ def are_faces(topology: Topology, corners: torch.Tensor) -> torch.Tensor:
         return torch.zeros_like(corners[:, 0], dtype=torch.bool)
     backend = _backend(corners)
     with backend.exclusive():
-        stars = _Stars(backend, *map(backend.uints, (*topology.vertex_cells, topology.tets)))
+        stars = Stars.of(backend, topology)
         columns = [backend.uints(column) for column in corners.unbind(1)]
         return backend.tensor(replayed(_are_faces, stars, columns)) > 0
+
+
+def is_corner(corners: Any, vertex: Any) -> Any:
+    """Which cells have a vertex, of tensors and in kernels alike.
+
+    Args:
+        corners: (4, M) the cells' vertices: torch takes ten times as long to look through columns of four.
+        vertex: (M,) the vertex asked for in each cell.
+
+    Returns:
+        (M,) bool.
+    """
+    return (corners[0] == vertex) | (corners[1] == vertex) | (corners[2] == vertex) | (corners[3] == vertex)
 
 
 def _backend(table: torch.Tensor) -> Backend:
@@ -155,23 +165,42 @@ def _faces_of_corners(backend: Backend, across: Any, rank: Any) -> Any:
 
 
 @dataclass
-class _Stars:
-    """Cells around vertices, see :attr:`difftetvr.mesh.Topology.vertex_cells`, and their (T, 4) vertices, flat."""
+class Stars:
+    """Cells around vertices as kernels read them, flat.
+
+    Attributes:
+        backend: Array types.
+        offsets, cells: See :attr:`difftetvr.mesh.Topology.vertex_cells`.
+        tets: (T, 4) vertices of cells.
+    """
 
     backend: Backend
     offsets: Any
     cells: Any
     tets: Any
 
+    @staticmethod
+    def of(backend: Backend, topology: Topology) -> Stars:
+        """Those of a mesh."""
+        return Stars(backend, *map(backend.uints, (*topology.vertex_cells, topology.tets)))
 
-def _are_faces(stars: _Stars, corners: list[Any]) -> Any:
+    def around(self, vertex: Any) -> tuple[Any, Any]:
+        """First of the places that stand for the cells around a vertex, and the one behind the last."""
+        first, end = (dr.gather(self.backend.UInt, self.offsets, vertex + k) for k in range(2))
+        return first, end
+
+    def tet(self, place: Any) -> Any:
+        """Vertices of the cell at a place."""
+        return dr.gather(self.backend.UInt4, self.tets, dr.gather(self.backend.UInt, self.cells, place))
+
+
+def _are_faces(stars: Stars, corners: list[Any]) -> Any:
     uint, (first, second, third) = stars.backend.UInt, corners
-    begin, end = (dr.gather(uint, stars.offsets, first + k) for k in range(2))
+    begin, end = stars.around(first)
 
     def look(place: Any, found: Any) -> tuple[Any, Any]:
-        tet = dr.gather(stars.backend.UInt4, stars.tets, dr.gather(uint, stars.cells, place))
-        has = [(tet[0] == v) | (tet[1] == v) | (tet[2] == v) | (tet[3] == v) for v in (second, third)]
-        return place + 1, dr.select(has[0] & has[1], uint(1), found)
+        tet = stars.tet(place)
+        return place + 1, dr.select(is_corner(tet, second) & is_corner(tet, third), uint(1), found)
 
     state = (begin, dr.zeros(uint, dr.width(first)))
     _, found = dr.while_loop(state, lambda place, found: (place < end) & (found == 0), look)

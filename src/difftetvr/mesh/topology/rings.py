@@ -8,10 +8,9 @@ from typing import Any
 import drjit as dr
 import torch
 
-from difftetvr.backend import Backend, get_backend
+from difftetvr.backend import NONE, Backend, get_backend
 from difftetvr.mesh.arrays import constant, true_indices
 from difftetvr.mesh.topology.incidence import cell_edges, cells_per_edge
-from difftetvr.mesh.topology.lookup import NONE
 from difftetvr.mesh.topology.topology import LOCAL_EDGES, Topology
 from difftetvr.recording import eager, few_lengths, replayed
 
@@ -69,13 +68,10 @@ def closed_rings(topology: Topology, size: int) -> Rings:
         backend.run(found)
         is_closed, *columns = (backend.tensor(column) for column in found)
     closed = true_indices(is_closed > 0)
-    ring, cells = (torch.stack([column.index_select(0, closed) for column in c], 1) for c in _halves(columns))
+    halves = columns[:size], columns[size:]
+    ring, cells = (torch.stack([column.index_select(0, closed) for column in half], 1) for half in halves)
     rows = rows.index_select(0, closed)
     return Rings(rows.int(), topology.edges.index_select(0, rows), ring, cells)
-
-
-def _halves(columns: list[torch.Tensor]) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
-    return columns[: len(columns) // 2], columns[len(columns) // 2 :]
 
 
 def _first_places(topology: Topology) -> torch.Tensor:
@@ -126,8 +122,8 @@ def _walk(fans: _Fans, size: int) -> list[Any]:
     first, vertex = dr.select(is_ascending, x, y), dr.select(is_ascending, y, x)
     first_cell, behind = cell, first
     vertices, cells, is_closed = [first], [cell], dr.full(fans.backend.Bool, True, dr.width(fans.places))
+    corners = dr.gather(fans.backend.UInt4, fans.tets, cell)
     for step in range(size):
-        corners = dr.gather(fans.backend.UInt4, fans.tets, cell, is_closed)
         across = uint(0)
         for k in range(1, 4):
             across = dr.select(corners[k] == behind, k, across)

@@ -13,12 +13,12 @@ from typing import Any
 import drjit as dr
 import torch
 
-from difftetvr.backend import Backend
+from difftetvr.backend import NONE, Backend
 from difftetvr.mesh import TetMesh
 from difftetvr.mesh.topology.topology import Topology
 from difftetvr.recording import few_lengths
 from difftetvr.rendering.search.hierarchy import curve_order
-from difftetvr.rendering.search.scene import NONE, boundary_half_faces
+from difftetvr.rendering.search.scene import boundary_half_faces
 from difftetvr.rendering.traversal.walk import walk_table
 
 

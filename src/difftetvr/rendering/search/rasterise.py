@@ -8,8 +8,9 @@ from typing import Any
 
 import drjit as dr
 
+from difftetvr.backend import NONE
 from difftetvr.rendering.search.hits import Hit
-from difftetvr.rendering.search.scene import NONE, Scene
+from difftetvr.rendering.search.scene import Scene
 from difftetvr.rendering.traversal.rays import largest_coordinate, rounding_of
 from difftetvr.rendering.traversal.walk import Corner, crossing_depth, holds_ray, interpolate, make_face
 

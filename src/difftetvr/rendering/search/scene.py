@@ -17,9 +17,6 @@ from difftetvr.mesh.topology.topology import LOCAL_FACES, Topology
 from difftetvr.rendering.traversal.rays import Frame, ImageRays, KernelRays, edge_function, is_left
 from difftetvr.rendering.traversal.walk import Corner, Face, make_face
 
-NONE = 0xFFFFFFFF
-"""Stands for no half-face, no node of a list, no cell."""
-
 
 @dataclass(frozen=True)
 class Cells:

@@ -10,9 +10,9 @@ from typing import Any
 
 import drjit as dr
 
-from difftetvr.backend import Backend
+from difftetvr.backend import NONE, Backend
 from difftetvr.mesh.shapes import Vector, cross, dot
-from difftetvr.rendering.search.scene import NONE, Cells
+from difftetvr.rendering.search.scene import Cells
 from difftetvr.rendering.traversal.sums import raise_to
 
 UNSETTLED, DENTED, BEHIND = 1, 2, 4

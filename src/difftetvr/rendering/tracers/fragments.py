@@ -12,7 +12,7 @@ from typing import Any
 
 import drjit as dr
 
-from difftetvr.backend import Backend
+from difftetvr.backend import NONE, Backend
 from difftetvr.mesh import TetMesh
 from difftetvr.recording import few_lengths
 from difftetvr.rendering.search.beams import Beam
@@ -22,7 +22,7 @@ from difftetvr.rendering.search.hits import Hit, Settle, Visit
 from difftetvr.rendering.search.memory_order import MemoryOrder, MeshTables
 from difftetvr.rendering.search.plan import Around, Counts, Found, Search, Told
 from difftetvr.rendering.search.rasterise import for_each_hit, work_items, workers_for
-from difftetvr.rendering.search.scene import NONE, Scene
+from difftetvr.rendering.search.scene import Scene
 from difftetvr.rendering.search.starts import AROUND, cells_around
 from difftetvr.rendering.traversal.rays import ImageRays
 from difftetvr.rendering.traversal.walk import crossing_depth, find_exit, holds_ray

@@ -13,13 +13,12 @@ from typing import Any
 
 import drjit as dr
 
-from difftetvr.backend import Backend
+from difftetvr.backend import NONE, Backend
 from difftetvr.mesh import TetMesh
 from difftetvr.recording import few_lengths
 from difftetvr.rendering.search.bundle_hits import Stretches
 from difftetvr.rendering.search.memory_order import MemoryOrder
 from difftetvr.rendering.search.plan import Search, SearchPlan
-from difftetvr.rendering.search.scene import NONE
 from difftetvr.rendering.tracers.aim import Aim
 from difftetvr.rendering.tracers.bands import Band, bands_of
 from difftetvr.rendering.tracers.fragments import (
