@@ -1,9 +1,11 @@
 """Where a reconstruction spends its time: the parts of an iteration and of a refinement.
 
 The Tooth from its views, with the options of a fit; some cycles of iterations and a refinement are done first, so that
-kernels are there and the mesh is as irregular as in a run. Times are exclusive: what a part calls counts there.
+kernels are there and the mesh is as irregular as in a run. Times are exclusive: what a part calls counts there. A cycle
+after those that are timed is watched by the profilers of Dr.Jit and PyTorch; what neither of them accounts for of a
+timed cycle is Python's.
 
-    python benchmarks/fit_profile.py [--cells 20000 303000] [--sizes 128] [--cycles 2]
+    python benchmarks/fit_profile.py [--cells 20000 303000 1000000] [--sizes 128 512] [--cycles 2]
 """
 
 from __future__ import annotations
@@ -13,12 +15,15 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from typing import Any
 from unittest.mock import patch
 
+import drjit as dr
 import torch
 from rich.console import Console
 from rich.table import Table
+from torch.profiler import ProfilerActivity
 
 import difftetvr as dtv
 from difftetvr.capture.truth import Truth
@@ -46,6 +51,7 @@ PARTS: dict[str, tuple[Any, str]] = {
     "what edges win": (exchange_round, "bisection_gains"),
     "errors before and after": (Judgement, "error"),
     "carrying parameters": (Trainer, "_apply"),
+    "evaluation": (Trainer, "glance"),
 }
 
 
@@ -91,25 +97,80 @@ class Stopwatch:
         return timed
 
 
-def profile(capture: dtv.Capture, cells: int, cycles: int) -> tuple[Stopwatch, int, int]:
-    """Times of some cycles, their iterations, and cells of the mesh."""
-    trainer = Trainer(capture, dtv.FitConfig(iterations=ITERATIONS, cells=cells, evaluate_every=0))
+@dataclass(frozen=True)
+class Profile:
+    """What was measured of some cycles.
+
+    Attributes:
+        watch: Seconds of parts, of all cycles.
+        iterations: Iterations of a cycle.
+        cells: Cells of the mesh.
+        kernels: Seconds of a cycle in Dr.Jit's kernels.
+        pytorch: Seconds of a cycle in PyTorch's operations.
+    """
+
+    watch: Stopwatch
+    iterations: float
+    cells: int
+    kernels: float
+    pytorch: float
+
+
+def profile(capture: dtv.Capture, cells: int, cycles: int) -> Profile:
+    """Where the time of some cycles goes."""
+    config = dtv.FitConfig(iterations=ITERATIONS, cells=cells)
+    trainer = Trainer(capture, config)
     watch = Stopwatch()
+
+    def run(refinements: int) -> int:
+        first, goal = trainer.iteration, len(trainer.history.refinements) + refinements
+        while len(trainer.history.refinements) < goal:
+            trainer.step()
+            if trainer.iteration % config.evaluate_every == 0:
+                trainer.glance()
+        return trainer.iteration - first
+
+    run(2)
     with ExitStack() as stack:
         for name, (owner, attribute) in PARTS.items():
             stack.enter_context(patch.object(owner, attribute, watch.watch(name, getattr(owner, attribute))))
-
-        def run(refinements: int) -> int:
-            first, goal = trainer.iteration, len(trainer.history.refinements) + refinements
-            while len(trainer.history.refinements) < goal:
-                trainer.step()
-            return trainer.iteration - first
-
-        run(2)
         watch.reset()
         iterations = run(cycles)
         watch._pass("")
-    return watch, iterations, trainer.mesh.num_cells
+    kernels, pytorch = seconds_by_layer(lambda: run(1))
+    return Profile(watch, iterations / cycles, trainer.mesh.num_cells, kernels, pytorch)
+
+
+def seconds_by_layer(work: Callable[[], Any]) -> tuple[float, float]:
+    """Seconds in Dr.Jit's kernels, and in PyTorch's operations."""
+    dr.kernel_history_clear()
+    with (
+        dr.scoped_set_flag(dr.JitFlag.KernelHistory, True),
+        torch.profiler.profile(activities=[ProfilerActivity.CPU]) as log,
+    ):
+        work()
+    kernels = sum(entry["execution_time"] for entry in dr.kernel_history()) / 1e3
+    return kernels, sum(event.self_cpu_time_total for event in log.key_averages()) / 1e6
+
+
+def table_of(profile: Profile, size: int, cycles: int) -> Table:
+    """Parts by their share, and below them the layers."""
+    seconds = {name: total / cycles for name, total in profile.watch.seconds.most_common()}
+    whole = sum(seconds.values())
+    title = f"{profile.cells} cells, {size} x {size} pixels, per cycle of {profile.iterations:g}"
+    table = Table(title=title)
+    for heading in ("part", "calls", "seconds", "ms a call", "share"):
+        table.add_column(heading, justify="left" if heading == "part" else "right")
+    for name, spent in seconds.items():
+        calls = profile.watch.calls[name] / cycles
+        each = f"{1e3 * spent / calls:.2f}" if calls else ""
+        table.add_row(name, f"{calls:g}", f"{spent:.2f}", each, f"{spent / whole:.0%}")
+    table.add_row("all", "", f"{whole:.2f}", "", "100%", end_section=True)
+    layers = {"kernels": profile.kernels, "PyTorch": profile.pytorch}
+    layers["Python"] = whole - sum(layers.values())
+    for name, spent in layers.items():
+        table.add_row(name, "", f"{spent:.2f}", "", f"{spent / whole:.0%}")
+    return table
 
 
 def main() -> None:
@@ -124,18 +185,7 @@ def main() -> None:
     for size in arguments.sizes:
         capture = dtv.VolumeCapture(width=size, height=size).build()
         for cells in arguments.cells:
-            watch, iterations, count = profile(capture, cells, arguments.cycles)
-            table = Table(title=f"{count} cells, {size} x {size} pixels, per cycle of {iterations // arguments.cycles}")
-            for heading in ("part", "calls", "seconds", "ms a call", "share"):
-                table.add_column(heading, justify="left" if heading == "part" else "right")
-            total = sum(watch.seconds.values())
-            for name, seconds in watch.seconds.most_common():
-                calls = watch.calls[name]
-                each = f"{1e3 * seconds / calls:.2f}" if calls else ""
-                row = (name, calls / arguments.cycles, seconds / arguments.cycles)
-                table.add_row(row[0], f"{row[1]:g}", f"{row[2]:.2f}", each, f"{seconds / total:.0%}")
-            table.add_row("all", "", f"{total / arguments.cycles:.2f}", "", "100%")
-            console.print(table)
+            console.print(table_of(profile(capture, cells, arguments.cycles), size, arguments.cycles))
 
 
 if __name__ == "__main__":

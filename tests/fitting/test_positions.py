@@ -276,6 +276,27 @@ def test_follows_a_change_of_the_mesh(boundary):
     assert torch.equal(optimizer.mesh.vertices[side], change.mesh.vertices[side])
 
 
+@properties
+@given(seed=seeds, boundary=boundaries, length=st.sampled_from([1e-3, 0.05, 10.0]))
+def test_moves_to_places_as_far_as_the_mesh_allows(seed, boundary, length):
+    mesh = jittered_grid(seed)
+    optimizer = VertexOptimizer(mesh, VertexOptimizerConfig(boundary=boundary))
+    step_with(optimizer, gradients(mesh, seed)[0])
+    state, old = optimizer.state(), optimizer.mesh.vertices.detach()
+    places = old + length * gradients(mesh, seed + 1)[0]
+    optimizer.move_to(places)
+    TetMesh(optimizer.mesh.vertices.detach(), mesh.tets)
+    inner = ~on_box(mesh.vertices).any(1)
+    if length == 1e-3:
+        torch.testing.assert_close(optimizer.mesh.vertices[inner].detach(), places[inner])
+    sides = on_box(mesh.vertices)
+    assert torch.equal(optimizer.mesh.vertices.detach()[sides], mesh.vertices[sides])
+    for name in ("first_moment", "second_moment", "steps"):
+        assert torch.equal(optimizer.state()[name], state[name])
+    optimizer.move_to(optimizer.mesh.vertices)
+    assert optimizer.mesh.vertices.requires_grad and optimizer.mesh.vertices.grad is None
+
+
 def test_says_what_is_missing():
     mesh = jittered_grid()
     optimizer = VertexOptimizer(mesh)

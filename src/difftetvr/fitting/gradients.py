@@ -47,7 +47,7 @@ class ViewGradients:
         Returns:
             Means of the loss and of the squared error, float64 scalars where the truth is.
         """
-        leaves = self.parameters.leaves(self.config.bands_at(iteration))
+        leaves = self.parameters.trained(self.config.bands_at(iteration))
         leaves += [mesh.vertices] if mesh.vertices.requires_grad else []
         leaves += [] if self.cameras is None else self.cameras.leaves()
         before = mesh.vertices.grad  # of earlier iterations, in which all processes have a part already

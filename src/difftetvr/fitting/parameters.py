@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch.optim.adam import adam
@@ -151,13 +151,19 @@ class FieldParameters:
         harmonics = self.harmonics[:, : COUNTS[bands]] if self.harmonics is not None and bands else None
         return Field(self.color, self.density_unit * self.density, self.location, harmonics)
 
-    def leaves(self, bands: int) -> list[torch.Tensor]:
+    @property
+    def leaves(self) -> dict[str, torch.Tensor]:
+        """All that is learned, by name."""
+        directional = {} if self.harmonics is None else {"harmonics": self.harmonics}
+        return {"color": self.color, "density": self.density, **directional}
+
+    def trained(self, bands: int) -> list[torch.Tensor]:
         """What the gradients of :meth:`field` gather in.
 
         Args:
             bands: Bands of the harmonics that take part.
         """
-        return [self.color, self.density, *([self.harmonics] if self.harmonics is not None and bands else [])]
+        return [leaf for name, leaf in self.leaves.items() if bands or name != "harmonics"]
 
     def detached_field(self) -> Field:
         """A copy of the field as it is now, without gradients."""
@@ -188,7 +194,7 @@ class FieldParameters:
         density = change.carry(self.density_unit * self.density.detach()) / unit
         self.density_unit = unit
         self.is_free = self.is_free[change.parents[:, 0].long()] & ~change.is_new
-        for name, parameter in list(self._items()):
+        for name, parameter in self.leaves.items():
             value = density if name == "density" else change.carry(parameter.detach())
             setattr(self, name, self._optimizer.carry(parameter, value, change))
 
@@ -232,8 +238,9 @@ class FieldParameters:
 
     def state(self) -> dict[str, torch.Tensor]:
         """Parameters and optimiser state by name: all that the next step depends on."""
-        tensors = {**dict(self._items()), "density_unit": self.density_unit, "is_free": self.is_free}
-        for name, parameter in self._items():
+        leaves = self.leaves
+        tensors = {**leaves, "density_unit": self.density_unit, "is_free": self.is_free}
+        for name, parameter in leaves.items():
             for key, value in self._optimizer.state(parameter).items():
                 tensors[f"{name}.{key}"] = value
         return tensors
@@ -256,9 +263,3 @@ class FieldParameters:
     def _groups(self) -> list[list[torch.Tensor]]:
         """Parameters that share a learning rate."""
         return [[self.color], [self.density], [] if self.harmonics is None else [self.harmonics]]
-
-    def _items(self) -> Iterator[tuple[str, torch.Tensor]]:
-        yield "color", self.color
-        yield "density", self.density
-        if self.harmonics is not None:
-            yield "harmonics", self.harmonics

@@ -14,8 +14,8 @@ from difftetvr.fitting.motion import VertexOptimizerConfig
 from difftetvr.mesh.arrays import all_of_three
 from difftetvr.mesh.boundary import BoundaryConstraint
 from difftetvr.mesh.changes.change import MeshChange
-from difftetvr.mesh.motion import cap_move, guard_move
-from difftetvr.mesh.shapes import VertexShapes, dot, measure_vertices
+from difftetvr.mesh.motion import GuardedMove, cap_move, guard_move
+from difftetvr.mesh.shapes import CellShapes, VertexShapes, dot, measure_vertices
 from difftetvr.mesh.tetmesh import TetMesh
 from difftetvr.recording import replayed
 
@@ -119,10 +119,20 @@ class VertexOptimizer:
         shapes = measure_vertices(self.mesh, self._barrier)
         move, altitudes = self._proposal(gradient, shapes, rate)
         move, capped = cap_move(self._boundary.apply(old, move), altitudes, self.config.cap)
-        guarded = guard_move(self.mesh, move, self.config.limits, shapes.cells)
+        guarded = self._guarded(move, shapes.cells)
         moved = (~all_of_three(guarded.vertices == old)).sum()
-        self.mesh = self.mesh.with_vertices(guarded.vertices.requires_grad_())
         return torch.stack((moved, capped, guarded.halved, guarded.refused))
+
+    def move_to(self, places: torch.Tensor) -> None:
+        """Moves the vertices to other places, each as far as the boundary and the guard let it.
+
+        Moments stay as they are; gradients accumulated since the last step are forgotten.
+
+        Args:
+            places: (V, 3) where they shall be, such as the means of where they have been.
+        """
+        old = self.mesh.vertices.detach()
+        self._guarded(self._boundary.apply(old, places.detach().double() - old.double()))
 
     def carry(self, change: MeshChange) -> None:
         """Follows a change of the mesh's cells; gradients accumulated since the last step are forgotten.
@@ -189,6 +199,12 @@ class VertexOptimizer:
                 else BoundaryConstraint.fixed(self.mesh)
             )
         return self._constraint
+
+    def _guarded(self, move: torch.Tensor, before: CellShapes | None = None) -> GuardedMove:
+        """Moves the vertices by what the guard allows of a (V, 3) move."""
+        guarded = guard_move(self.mesh, move, self.config.limits, before)
+        self.mesh = self.mesh.with_vertices(guarded.vertices.requires_grad_())
+        return guarded
 
     def _finite_gradient(self) -> torch.Tensor:
         """(V, 3)."""

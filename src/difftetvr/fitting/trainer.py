@@ -25,6 +25,7 @@ from difftetvr.fitting.records.history import History
 from difftetvr.fitting.records.unread import Unread
 from difftetvr.fitting.refinement import Refinement, Situation, Strategy
 from difftetvr.fitting.refinement.adaptive_run import AdaptiveRun
+from difftetvr.fitting.refinement.iterate_mean import IterateMean
 from difftetvr.fitting.refinement.pixels import Judgement
 from difftetvr.mesh.field import Field
 from difftetvr.mesh.tetmesh import TetMesh
@@ -96,6 +97,7 @@ class Trainer(AdaptiveRun):
         self.iteration = 0
         self.history = History()
         self._unread = Unread()
+        self._mean = IterateMean(self._averaging)
         self._train_views, self._test_views = capture.train_indices.tolist(), capture.test_indices.tolist()
         self._truth = Truth(capture, self._mesh.vertices.device).keep(self._train_views + self._glanced_views())
         self.cameras = _cameras(capture, config)
@@ -139,6 +141,7 @@ class Trainer(AdaptiveRun):
             self.cameras.step(batch, self.iteration / self.config.steps)
         if is_read:
             self._unread.read_moves(self.history)
+        self._mean.add(self._iterate_now())
         self.iteration += 1
         if self.iteration == self.config.steps:
             self._keep_free()
@@ -258,6 +261,7 @@ class Trainer(AdaptiveRun):
         if self.strategy is None or not self.strategy.is_due(self._moment()):
             return
         self.catch_up()
+        self._even_out()
         with self.processes.in_order():
             self._refine(self.strategy)
         self.require_agreement()
@@ -291,6 +295,9 @@ class Trainer(AdaptiveRun):
         )
         # Colours by direction are known for rays that start at one point.
         return judgement if self.parameters.harmonics is not None else judgement.together()
+
+    def _learned(self) -> dict[str, torch.Tensor]:
+        return self.parameters.leaves
 
     def _apply(self, refinement: Refinement) -> None:
         for change in refinement.changes:

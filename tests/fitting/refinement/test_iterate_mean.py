@@ -1,0 +1,115 @@
+"""Means over iterations: their weights, where they begin anew, and what refinements begin with."""
+
+import dataclasses
+
+import pytest
+import torch
+from hypotheses import examples
+from hypothesis import given
+from hypothesis import strategies as st
+
+from difftetvr.fitting import FitConfig, fit
+from difftetvr.fitting.records.checkpoint import Checkpoint
+from difftetvr.fitting.refinement import Exchange
+from difftetvr.fitting.refinement.iterate_mean import IterateMean
+from difftetvr.fitting.trainer import Trainer
+
+properties = examples(20)
+counts = st.integers(1, 12)
+ROUNDS = FitConfig(cells=300, iterations=16, evaluate_every=0, device="cpu", exchange=Exchange(rounds=2, views=3))
+
+
+def iterates(count, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return [{"x": torch.rand(3, 2, generator=generator, dtype=torch.float64)} for _ in range(count)]
+
+
+def mean_of(some, share):
+    mean = IterateMean(share)
+    for iterate in some:
+        mean.add(iterate)
+    return mean
+
+
+@properties
+@given(count=counts, inverse=st.integers(1, 5), seed=st.integers(0, 2**32 - 1))
+def test_weights_are_those_of_polynomial_decay(count, inverse, seed):
+    """With share 1 / (p + 1) the k-th iterate weighs like (k + p - 1)! / (k - 1)!, which is about k^p."""
+    some = iterates(count, seed)
+    power = inverse - 1
+    weights = torch.tensor([float(torch.arange(k, k + power).prod()) for k in range(1, count + 1)]).double()
+    expected = sum(w * one["x"] for w, one in zip(weights / weights.sum(), some, strict=True))
+    torch.testing.assert_close(mean_of(some, 1.0 / inverse).take()["x"], expected)
+
+
+def test_a_share_of_nothing_keeps_nothing():
+    mean = mean_of(iterates(3), 0.0)
+    assert mean.take() == {} and mean.state(iterates(1)[0]) == {}
+
+
+def test_taking_begins_anew():
+    mean = mean_of(iterates(4), 0.5)
+    mean.take()
+    assert mean.take() == {}
+    last = {"x": torch.full((7, 2), 3.0)}
+    mean.add(last)
+    assert torch.equal(mean.take()["x"], last["x"])
+
+
+@properties
+@given(before=st.integers(0, 5), after=counts)
+def test_goes_on_from_a_saved_state_to_the_bit(before, after):
+    some = iterates(before + after)
+    straight = mean_of(some[:before], 0.3)
+    saved = {name: tensor.clone() for name, tensor in straight.state(some[0]).items()}
+    resumed = IterateMean(0.3)
+    resumed.restore(saved, some[0])
+    for iterate in some[before:]:
+        straight.add(iterate)
+        resumed.add(iterate)
+    assert torch.equal(straight.take()["x"], resumed.take()["x"])
+
+
+def test_iterates_may_change_in_place_after_they_were_added():
+    leaf = torch.ones(3)
+    mean = mean_of([{"x": leaf}], 0.5)
+    leaf += 1.0
+    assert torch.equal(mean.take()["x"], torch.ones(3))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_a_refinement_begins_with_the_means_since_the_last_one(small_capture, monkeypatch, share):
+    config = dataclasses.replace(ROUNDS, exchange=dataclasses.replace(ROUNDS.exchange, averaging=share))
+    trainer, begun = Trainer(small_capture, config), []
+    refine = Trainer._refine
+    monkeypatch.setattr(Trainer, "_refine", lambda self, strategy: begun.append(now(self)) or refine(self, strategy))
+
+    def now(run):
+        return {name: tensor.detach().clone() for name, tensor in run._iterate_now().items()}
+
+    mean, expected = IterateMean(share or 1.0), []
+    while trainer.iteration < config.steps:
+        if trainer.strategy.is_due(trainer._moment()):
+            means = mean.take()
+            expected.append(means if share else now(trainer))
+        trainer.step()
+        mean.add(now(trainer))
+    for first, second in zip(begun, expected, strict=True):
+        for name, tensor in first.items():
+            torch.testing.assert_close(tensor, second[name], rtol=1e-5, atol=1e-6, msg=name)
+    assert len(begun) == 2
+
+
+def test_a_checkpoint_of_before_there_were_means_begins_one(small_capture, tmp_path):
+    path = tmp_path / "c.safetensors"
+    trainer = Trainer(small_capture, ROUNDS)
+    for _ in range(3):
+        trainer.step()
+    saved = trainer.checkpoint()
+    older = {name: tensor for name, tensor in saved.tensors.items() if not name.startswith("mean")}
+    assert len(older) < len(saved.tensors)
+    dataclasses.replace(saved, tensors=older).save(path)
+    resumed = Trainer.resume(small_capture, ROUNDS, Checkpoint.load(path))
+    assert int(resumed.checkpoint().tensors["mean_count"]) == 0
+    result = fit(small_capture, ROUNDS, checkpoint=path, resume=True)
+    assert len(result.history.refinements) == 2
