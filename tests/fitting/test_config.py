@@ -101,6 +101,7 @@ def test_given_backgrounds():
         {"rate": 0.0},
         {"final_rate": float("nan")},
         {"pace": 0.0},
+        {"averaging": 1.5},
         {"haze_penalty": -1.0},
         {"initial_color": 2.0},
         {"betas": (0.9, 1.0)},

@@ -61,7 +61,7 @@ def test_what_is_left_open_is_chosen_for_the_images(shiny: dtv.Capture) -> None:
     of_light = dtv.FitConfig().for_capture(light)
     assert (light.encoding, of_light.harmonics, of_light.density_rate, of_light.pace) == ("linear", 0, 1.0, 8.0)
     options = {"background": "white", "harmonics": 0, "cells": 500, "start": "grid", "iterations": 9}
-    given = dtv.FitConfig(**options, free_space=0.1, density_rate=2.0, pace=3.0)
+    given = dtv.FitConfig(**options, free_space=0.1, density_rate=2.0, pace=3.0, averaging=0.5)
     assert given.for_capture(shiny) == given
     assert dtv.FitConfig.from_json(chosen.to_json()) == chosen
 

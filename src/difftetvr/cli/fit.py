@@ -64,7 +64,7 @@ class Fit:
         ),
         "Mesh": ("start", "grid", "initial-mesh", "repair", "location"),
         "Motion": ("move", "pace", "motion.*"),
-        "Refinement": ("refine", *(f"{strategy}.*" for strategy in get_args(Refine))),
+        "Refinement": ("refine", "averaging", *(f"{strategy}.*" for strategy in get_args(Refine))),
         "Optimisation": (
             *("loss", "harmonics", "harmonics-rate", "density-rate", "rate", "final-rate", "betas", "batch-views"),
             *("haze-penalty", "free-space", "sparsity", "initial-color", "initial-density", "seed", "deterministic"),

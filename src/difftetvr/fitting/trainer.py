@@ -97,7 +97,7 @@ class Trainer(AdaptiveRun):
         self.iteration = 0
         self.history = History()
         self._unread = Unread()
-        self._mean = IterateMean(self._averaging)
+        self._mean = IterateMean(config.averaging or 0.0)
         self._train_views, self._test_views = capture.train_indices.tolist(), capture.test_indices.tolist()
         self._truth = Truth(capture, self._mesh.vertices.device).keep(self._train_views + self._glanced_views())
         self.cameras = _cameras(capture, config)
@@ -226,9 +226,11 @@ class Trainer(AdaptiveRun):
                 the options ask for.
         """
         # However many processes go on: the run stays what it is.
-        config = replace(config, batch_views=config.batch_views or checkpoint.config.batch)
-        asked = config.for_capture(capture)
-        checkpoint.config.require_same_run(asked)
+        saved = checkpoint.config
+        saved = replace(saved, averaging=saved.averaging or 0.0)  # as runs did of before there was this option
+        averaging = saved.averaging if config.averaging is None else config.averaging
+        config = replace(config, batch_views=config.batch_views or saved.batch, averaging=averaging)
+        saved.require_same_run(config.for_capture(capture))
         trainer = Trainer(capture, config, checkpoint.mesh(), strategy, processes)
         require_same_capture(checkpoint.capture, trainer._capture_description)
         checkpoint.require_strategy(type(trainer.strategy).__name__)

@@ -152,7 +152,9 @@ def test_starts_and_cells_are_chosen_for_the_images(ball: dtv.Capture, room: dtv
     )
     assert dtv.FitConfig().for_capture(large).cells == 17 * 400 * 400 // 12
     assert dtv.FitConfig().for_capture(ball).cells == 20_000
-    assert dtv.FitConfig().for_capture(dataclasses.replace(large, encoding="linear")).cells == 20_000
+    volume = dataclasses.replace(large, encoding="linear")
+    assert dtv.FitConfig().for_capture(volume).cells == 20_000
+    assert [dtv.FitConfig().for_capture(seen).averaging for seen in (volume, ball, room)] == [0.25, 0.0, 0.0]
 
 
 def test_densities_are_counted_in_smaller_units_far_away(room: dtv.Capture) -> None:

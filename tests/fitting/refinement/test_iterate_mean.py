@@ -8,7 +8,8 @@ from hypotheses import examples
 from hypothesis import given
 from hypothesis import strategies as st
 
-from difftetvr.fitting import FitConfig, fit
+from difftetvr.errors import FitError
+from difftetvr.fitting import FitConfig
 from difftetvr.fitting.records.checkpoint import Checkpoint
 from difftetvr.fitting.refinement import Exchange
 from difftetvr.fitting.refinement.iterate_mean import IterateMean
@@ -79,7 +80,7 @@ def test_iterates_may_change_in_place_after_they_were_added():
 
 @pytest.mark.parametrize("share", [0.0, 0.5])
 def test_a_refinement_begins_with_the_means_since_the_last_one(small_capture, monkeypatch, share):
-    config = dataclasses.replace(ROUNDS, exchange=dataclasses.replace(ROUNDS.exchange, averaging=share))
+    config = dataclasses.replace(ROUNDS, averaging=share)
     trainer, begun = Trainer(small_capture, config), []
     refine = Trainer._refine
     monkeypatch.setattr(Trainer, "_refine", lambda self, strategy: begun.append(now(self)) or refine(self, strategy))
@@ -100,16 +101,17 @@ def test_a_refinement_begins_with_the_means_since_the_last_one(small_capture, mo
     assert len(begun) == 2
 
 
-def test_a_checkpoint_of_before_there_were_means_begins_one(small_capture, tmp_path):
+def test_a_run_of_before_there_were_means_goes_on_without(small_capture, tmp_path):
     path = tmp_path / "c.safetensors"
-    trainer = Trainer(small_capture, ROUNDS)
-    for _ in range(3):
+    trainer = Trainer(small_capture, dataclasses.replace(ROUNDS, averaging=0.0))
+    for _ in range(9):
         trainer.step()
     saved = trainer.checkpoint()
-    older = {name: tensor for name, tensor in saved.tensors.items() if not name.startswith("mean")}
-    assert len(older) < len(saved.tensors)
-    dataclasses.replace(saved, tensors=older).save(path)
+    dataclasses.replace(saved, config=dataclasses.replace(saved.config, averaging=None)).save(path)
     resumed = Trainer.resume(small_capture, ROUNDS, Checkpoint.load(path))
-    assert int(resumed.checkpoint().tensors["mean_count"]) == 0
-    result = fit(small_capture, ROUNDS, checkpoint=path, resume=True)
-    assert len(result.history.refinements) == 2
+    assert resumed.config.averaging == 0.0
+    resumed.step(), trainer.step()
+    for name, tensor in trainer.checkpoint().tensors.items():
+        assert torch.equal(resumed.checkpoint().tensors[name], tensor), name
+    with pytest.raises(FitError, match=r"averaging = 0.0, this run asks for 0.5"):
+        Trainer.resume(small_capture, dataclasses.replace(ROUNDS, averaging=0.5), Checkpoint.load(path))

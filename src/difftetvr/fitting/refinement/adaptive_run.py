@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -152,11 +151,6 @@ class AdaptiveRun:
         """As many of their pixels, at most, as so many views have; other strategies than these get all."""
         return self.strategy.pixels or _USUAL_PIXELS if isinstance(self.strategy, Exchange) else math.inf
 
-    @property
-    def _averaging(self) -> float:
-        """What share of the iterations the means are of that refinements begin with, see `Exchange`; for others 0."""
-        return self.strategy.averaging if isinstance(self.strategy, Exchange) else 0.0
-
     def _moment(self) -> Moment:
         return Moment(self.iteration, self.config.steps, self._epoch, self.mesh.num_cells, self.budget)
 
@@ -281,8 +275,6 @@ class AdaptiveRun:
             FitError: The checkpoint lacks something, or has come further than the options ask for.
         """
         saved.require_not_beyond(self.config.steps)
-        # Checkpoints of before there were means have none.
-        saved = replace(saved, tensors=self._mean.state(self._iterate_now()) | saved.tensors)
         saved.require_tensors_like(self.checkpoint().tensors)
         if self.positions:
             self.positions.restore({name.removeprefix(_POSITIONS): tensor for name, tensor in saved.tensors.items()})

@@ -38,9 +38,6 @@ class Exchange(OptionGroup):
     pixels: float | None = None
     """Pixels of these that are looked at, at most, in units of a view's; default: 12, for projections and for
     photographs that begin with a visual hull 36."""
-    averaging: float = 0.25
-    """A round begins with the means of values and vertices over about this share of the iterations since the last one,
-    in which it evens out that gradients of single views pull to and fro; 0: with what the last iteration left."""
     start: float = 0.6
     """New vertices start at this part of their best surplus over the interpolated values."""
     long: float = 0.6
@@ -64,7 +61,7 @@ class Exchange(OptionGroup):
         self._require(self.pixels is None or 0 < self.pixels < math.inf, "pixels", "greater than 0 and finite")
         self._require(0 <= self.share < 1, "share", "at least 0 and below 1")
         self._require(0 < self.initial <= 1, "initial", "greater than 0 and at most 1")
-        for name in ("averaging", "until", "start", "long", "min_quality"):
+        for name in ("until", "start", "long", "min_quality"):
             self._require(0 <= getattr(self, name) <= 1, name, "between 0 and 1")
 
     def settling(self: _Own, iterations: int) -> _Own:

@@ -94,7 +94,7 @@ class ScalarReconstruction(AdaptiveRun):
         self.scalars = Scalars(scalars.to(device), config.betas)
         self.iteration, self.history = 0, History()
         self._unread = Unread()
-        self._mean = IterateMean(self._averaging)
+        self._mean = IterateMean(config.averaging or 0.0)
 
     @property
     def function(self) -> TransferFunction:

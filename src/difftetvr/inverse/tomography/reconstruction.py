@@ -80,7 +80,7 @@ class Reconstruction(AdaptiveRun):
         self.budget = max(config.budget, self._mesh.num_cells if mesh is not None else 0)
         self.iteration, self.history = 0, History()
         self._unread = Unread()
-        self._mean = IterateMean(self._averaging)
+        self._mean = IterateMean(config.averaging or 0.0)
         self._description = _describe(capture)
 
     def step(self) -> None:
