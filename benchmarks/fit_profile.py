@@ -2,8 +2,8 @@
 
 The Tooth from its views, with the options of a fit; some cycles of iterations and a refinement are done first, so that
 kernels are there and the mesh is as irregular as in a run. Times are exclusive: what a part calls counts there. A cycle
-after those that are timed is watched by the profilers of Dr.Jit and PyTorch; what neither of them accounts for of a
-timed cycle is Python's.
+after those that are timed is watched by the profilers of Dr.Jit and PyTorch, for the shares of kernels and of PyTorch's
+operations in it; what is neither is Python, with what watching costs.
 
     python benchmarks/fit_profile.py [--cells 20000 303000 1000000] [--sizes 128 512] [--cycles 2]
 """
@@ -31,6 +31,7 @@ from difftetvr.fitting import gradients
 from difftetvr.fitting.parameters import FieldParameters
 from difftetvr.fitting.positions import VertexOptimizer
 from difftetvr.fitting.refinement import exchange_round
+from difftetvr.fitting.refinement.iterate_mean import IterateMean
 from difftetvr.fitting.refinement.pixels import Judgement
 from difftetvr.fitting.trainer import Trainer
 from difftetvr.rendering.search import memory_order
@@ -52,6 +53,8 @@ PARTS: dict[str, tuple[Any, str]] = {
     "errors before and after": (Judgement, "error"),
     "carrying parameters": (Trainer, "_apply"),
     "evaluation": (Trainer, "glance"),
+    "means": (Trainer, "_even_out"),
+    "adding to means": (IterateMean, "add"),
 }
 
 
@@ -105,15 +108,13 @@ class Profile:
         watch: Seconds of parts, of all cycles.
         iterations: Iterations of a cycle.
         cells: Cells of the mesh.
-        kernels: Seconds of a cycle in Dr.Jit's kernels.
-        pytorch: Seconds of a cycle in PyTorch's operations.
+        layers: Shares of one more cycle by what works.
     """
 
     watch: Stopwatch
     iterations: float
     cells: int
-    kernels: float
-    pytorch: float
+    layers: dict[str, float]
 
 
 def profile(capture: dtv.Capture, cells: int, cycles: int) -> Profile:
@@ -137,20 +138,23 @@ def profile(capture: dtv.Capture, cells: int, cycles: int) -> Profile:
         watch.reset()
         iterations = run(cycles)
         watch._pass("")
-    kernels, pytorch = seconds_by_layer(lambda: run(1))
-    return Profile(watch, iterations / cycles, trainer.mesh.num_cells, kernels, pytorch)
+    return Profile(watch, iterations / cycles, trainer.mesh.num_cells, shares_of_layers(lambda: run(1)))
 
 
-def seconds_by_layer(work: Callable[[], Any]) -> tuple[float, float]:
-    """Seconds in Dr.Jit's kernels, and in PyTorch's operations."""
+def shares_of_layers(work: Callable[[], Any]) -> dict[str, float]:
+    """Shares of the time in Dr.Jit's kernels, in PyTorch's operations, and of the rest."""
     dr.kernel_history_clear()
+    began = time.perf_counter()
     with (
         dr.scoped_set_flag(dr.JitFlag.KernelHistory, True),
         torch.profiler.profile(activities=[ProfilerActivity.CPU]) as log,
     ):
         work()
+        whole = time.perf_counter() - began
     kernels = sum(entry["execution_time"] for entry in dr.kernel_history()) / 1e3
-    return kernels, sum(event.self_cpu_time_total for event in log.key_averages()) / 1e6
+    # Functions of one's own have events, too, in which kernels run.
+    pytorch = sum(event.self_cpu_time_total for event in log.key_averages() if event.key.startswith("aten::")) / 1e6
+    return {"kernels": kernels / whole, "PyTorch": pytorch / whole, "Python": 1.0 - (kernels + pytorch) / whole}
 
 
 def table_of(profile: Profile, size: int, cycles: int) -> Table:
@@ -166,10 +170,8 @@ def table_of(profile: Profile, size: int, cycles: int) -> Table:
         each = f"{1e3 * spent / calls:.2f}" if calls else ""
         table.add_row(name, f"{calls:g}", f"{spent:.2f}", each, f"{spent / whole:.0%}")
     table.add_row("all", "", f"{whole:.2f}", "", "100%", end_section=True)
-    layers = {"kernels": profile.kernels, "PyTorch": profile.pytorch}
-    layers["Python"] = whole - sum(layers.values())
-    for name, spent in layers.items():
-        table.add_row(name, "", f"{spent:.2f}", "", f"{spent / whole:.0%}")
+    for name, share in profile.layers.items():
+        table.add_row(name, "", "", "", f"{share:.0%}")
     return table
 
 

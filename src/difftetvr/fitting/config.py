@@ -11,7 +11,7 @@ from difftetvr.declared import require_declared
 from difftetvr.errors import FitError
 from difftetvr.fitting.cameras.options import CameraRefinement
 from difftetvr.fitting.motion import Motion
-from difftetvr.fitting.options import LARGEST_COUNT, Schedule, require
+from difftetvr.fitting.options import LARGEST_COUNT, RunOptions, Schedule, require
 from difftetvr.fitting.refinement import Exchange, Grow, Star, Strategy
 from difftetvr.mesh.limits import CELLS_PER_CUBE, MAX_CELLS, MAX_DEGREE
 
@@ -99,7 +99,7 @@ class FitConfig(Schedule):
     averaging: float | None = None
     """A refinement begins with the means of values and vertices over about this share of the iterations since the last
     one, in which it evens out that gradients of single views pull to and fro; 0: with what the last iteration left.
-    Default: 0.25, for photographs 0."""
+    Default: 0.25, for photographs and with --refine star 0."""
     location: Literal["vertex", "cell"] = "vertex"
     """Whether colour and density belong to vertices, linear in between, or to cells, constant inside."""
     iterations: int | None = None
@@ -213,6 +213,11 @@ class FitConfig(Schedule):
         return self.batch_views or 1
 
     @property
+    def averaged(self) -> float:
+        """Share of the iterations that means are of; 0 where it was left open, by runs of before there were means."""
+        return self.averaging or 0.0
+
+    @property
     def needs_alpha(self) -> bool:
         """Whether training images must be composited over something that is not black."""
         return self.background not in (None, "black", (0.0, 0.0, 0.0))
@@ -224,8 +229,18 @@ class FitConfig(Schedule):
             capture: Images and cameras.
         """
         choices = self._choices_for_photos(capture) if capture.encoding == "srgb" else _CHOICES_FOR_VOLUMES
+        if self.refine == "star":
+            choices = choices | {"averaging": 0.0}  # as in the article
         left_open = {name: choices[name] for name in CHOSEN_FOR_CAPTURE if getattr(self, name) is None}
         return dataclasses.replace(self, **left_open)
+
+    def require_same_run(self, other: RunOptions) -> None:
+        """See `RunOptions.require_same_run`; runs of before there were means had none."""
+        mine, theirs = (
+            dataclasses.replace(run, averaging=run.averaged) if isinstance(run, FitConfig) else run
+            for run in (self, other)
+        )
+        Schedule.require_same_run(mine, theirs)
 
     def for_processes(self, count: int) -> FitConfig:
         """These options with so many views per step, if that was left open."""

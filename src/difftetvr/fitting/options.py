@@ -119,9 +119,6 @@ class Schedule(RunOptions):
 
     All of it is a function of the options and the iteration alone, so a resumed run sees what an uninterrupted one
     would have seen. Subclasses have the fields that are named here.
-
-    Attributes:
-        averaging: See `FitConfig`; 0 where a run does not have this option.
     """
 
     seed: int
@@ -129,7 +126,6 @@ class Schedule(RunOptions):
     final_rate: float
     move: bool
     motion: Any
-    averaging: float | None = 0.0
 
     @property
     def batch(self) -> int:

@@ -151,7 +151,6 @@ class FieldParameters:
         harmonics = self.harmonics[:, : COUNTS[bands]] if self.harmonics is not None and bands else None
         return Field(self.color, self.density_unit * self.density, self.location, harmonics)
 
-    @property
     def leaves(self) -> dict[str, torch.Tensor]:
         """All that is learned, by name."""
         directional = {} if self.harmonics is None else {"harmonics": self.harmonics}
@@ -163,7 +162,7 @@ class FieldParameters:
         Args:
             bands: Bands of the harmonics that take part.
         """
-        return [leaf for name, leaf in self.leaves.items() if bands or name != "harmonics"]
+        return [leaf for name, leaf in self.leaves().items() if bands or name != "harmonics"]
 
     def detached_field(self) -> Field:
         """A copy of the field as it is now, without gradients."""
@@ -194,7 +193,7 @@ class FieldParameters:
         density = change.carry(self.density_unit * self.density.detach()) / unit
         self.density_unit = unit
         self.is_free = self.is_free[change.parents[:, 0].long()] & ~change.is_new
-        for name, parameter in self.leaves.items():
+        for name, parameter in self.leaves().items():
             value = density if name == "density" else change.carry(parameter.detach())
             setattr(self, name, self._optimizer.carry(parameter, value, change))
 
@@ -238,7 +237,7 @@ class FieldParameters:
 
     def state(self) -> dict[str, torch.Tensor]:
         """Parameters and optimiser state by name: all that the next step depends on."""
-        leaves = self.leaves
+        leaves = self.leaves()
         tensors = {**leaves, "density_unit": self.density_unit, "is_free": self.is_free}
         for name, parameter in leaves.items():
             for key, value in self._optimizer.state(parameter).items():

@@ -33,6 +33,7 @@ from difftetvr.rendering.gauss_newton import HatChoice, ImageModel
 
 _READ_EVERY = 25
 """Iterations from one question to a GPU how they went to the next: the host waits for each answer."""
+_VERTICES = "vertices"  # name of their mean
 _CAMERAS = "cameras."  # prefix of their state in a checkpoint
 
 
@@ -97,7 +98,7 @@ class Trainer(AdaptiveRun):
         self.iteration = 0
         self.history = History()
         self._unread = Unread()
-        self._mean = IterateMean(config.averaging or 0.0)
+        self._mean = IterateMean(0.0 if strategy is None else config.averaged)
         self._train_views, self._test_views = capture.train_indices.tolist(), capture.test_indices.tolist()
         self._truth = Truth(capture, self._mesh.vertices.device).keep(self._train_views + self._glanced_views())
         self.cameras = _cameras(capture, config)
@@ -194,7 +195,7 @@ class Trainer(AdaptiveRun):
             FitError: A loss on the way to it is not finite.
         """
         self.catch_up()
-        tensors = self._mesh_state() | self.parameters.state()
+        tensors = self._mesh_state() | self.parameters.state() | self._mean.state(self._iterate_now())
         if self.cameras is not None:
             tensors |= {_CAMERAS + name: tensor for name, tensor in self.cameras.state().items()}
         strategy = type(self.strategy).__name__
@@ -227,14 +228,14 @@ class Trainer(AdaptiveRun):
         """
         # However many processes go on: the run stays what it is.
         saved = checkpoint.config
-        saved = replace(saved, averaging=saved.averaging or 0.0)  # as runs did of before there was this option
-        averaging = saved.averaging if config.averaging is None else config.averaging
+        averaging = saved.averaged if config.averaging is None else config.averaging
         config = replace(config, batch_views=config.batch_views or saved.batch, averaging=averaging)
         saved.require_same_run(config.for_capture(capture))
         trainer = Trainer(capture, config, checkpoint.mesh(), strategy, processes)
         require_same_capture(checkpoint.capture, trainer._capture_description)
         checkpoint.require_strategy(type(trainer.strategy).__name__)
         trainer._go_on_from(checkpoint)
+        trainer._mean.restore(checkpoint.tensors, trainer._iterate_now())
         trainer.parameters.restore(checkpoint.tensors)
         if trainer.cameras is not None:
             trainer.cameras.restore({k.removeprefix(_CAMERAS): v for k, v in checkpoint.tensors.items()})
@@ -298,8 +299,22 @@ class Trainer(AdaptiveRun):
         # Colours by direction are known for rays that start at one point.
         return judgement if self.parameters.harmonics is not None else judgement.together()
 
-    def _learned(self) -> dict[str, torch.Tensor]:
-        return self.parameters.leaves
+    def _iterate_now(self) -> dict[str, torch.Tensor]:
+        """What is learned on the vertices, and where these are if they move."""
+        positions = {_VERTICES: self.positions.mesh.vertices} if self.positions else {}
+        return self.parameters.leaves() | positions
+
+    def _even_out(self) -> None:
+        """Lets values, and vertices that may move now, be their means over the iterations since the last refinement."""
+        means = self._mean.means
+        places = means.pop(_VERTICES, None)
+        if self.positions and places is not None and self._motion_rate() is not None:
+            self.positions.move_to(places)
+        leaves = self.parameters.leaves()
+        with torch.no_grad():
+            for name, mean in means.items():
+                leaves[name].copy_(mean)
+        self._mean.begin_anew()
 
     def _apply(self, refinement: Refinement) -> None:
         for change in refinement.changes:

@@ -1,8 +1,8 @@
 """Checkpoints: everything that the rest of a reconstruction depends on, in one safetensors file.
 
-The tensors are the mesh, the parameters, the optimiser's moments and the history; the file's header holds the rest as
-JSON, and a checksum of everything, because a run that goes on from a flipped bit would look like any other. One file,
-renamed into place, so that a run killed at any moment leaves the last checkpoint whole.
+The tensors are the mesh, the parameters, the optimiser's moments, means over iterations, and the history; the file's
+header holds the rest as JSON, and a checksum of everything, because a run that goes on from a flipped bit would look
+like any other. One file, renamed into place, so that a run killed at any moment leaves the last checkpoint whole.
 """
 
 from __future__ import annotations

@@ -17,7 +17,6 @@ from difftetvr.fitting.records.history import History, RefinementRecord
 from difftetvr.fitting.records.result import Picture, Progress
 from difftetvr.fitting.records.unread import Unread
 from difftetvr.fitting.refinement.exchange import Exchange
-from difftetvr.fitting.refinement.iterate_mean import IterateMean
 from difftetvr.fitting.refinement.strategy import (
     USUAL_VIEWS,
     EmptySpace,
@@ -35,7 +34,6 @@ from difftetvr.rendering import ScalarField
 
 _GLANCE_VIEWS = 4
 _USUAL_PIXELS = 12.0  # a third of those views: what a view sees beside the others is worth more than all that it sees
-_VERTICES = "vertices"
 _POSITIONS = "positions."  # prefix of the positions' state in a checkpoint
 
 
@@ -60,7 +58,6 @@ class AdaptiveRun:
     history: History
     processes: Processes
     _mesh: TetMesh
-    _mean: IterateMean
     _unread: Unread
     _train_views: list[int]
     _test_views: list[int]
@@ -171,24 +168,6 @@ class AdaptiveRun:
         elif (self.iteration + 1) % self.config.motion.every == 0:
             self._unread.add_moves(self.positions.advance(rate))
 
-    def _learned(self) -> dict[str, torch.Tensor]:
-        """Leaf tensors under optimisation whose mean over iterations makes sense, by name, but for vertices."""
-        raise NotImplementedError
-
-    def _iterate_now(self) -> dict[str, torch.Tensor]:
-        """What is learned, and where the vertices are if they move."""
-        return self._learned() | ({_VERTICES: self.positions.mesh.vertices} if self.positions else {})
-
-    def _even_out(self) -> None:
-        """Lets values and vertices be their means over the iterations since the last refinement."""
-        means = self._mean.take()
-        if self.positions and means:
-            self.positions.move_to(means.pop(_VERTICES))
-        learned = self._learned()
-        with torch.no_grad():
-            for name, mean in means.items():
-                learned[name].copy_(mean)
-
     def _adopt(self, change: MeshChange) -> None:
         """Follows a change of the mesh's cells."""
         if self.positions:
@@ -258,7 +237,7 @@ class AdaptiveRun:
 
     def _mesh_state(self) -> dict[str, torch.Tensor]:
         """What a checkpoint holds of the mesh and of how its vertices move, by name."""
-        tensors = {_VERTICES: self.mesh.vertices, "tets": self.mesh.tets, **self._mean.state(self._iterate_now())}
+        tensors = {"vertices": self.mesh.vertices, "tets": self.mesh.tets}
         if self.positions:
             state = self.positions.state()
             tensors |= {_POSITIONS + name: tensor for name, tensor in state.items() if name not in tensors}
@@ -278,7 +257,6 @@ class AdaptiveRun:
         saved.require_tensors_like(self.checkpoint().tensors)
         if self.positions:
             self.positions.restore({name.removeprefix(_POSITIONS): tensor for name, tensor in saved.tensors.items()})
-        self._mean.restore(saved.tensors, self._iterate_now())
         self.budget, self.iteration, self.history = saved.budget, saved.iteration, saved.history
 
 

@@ -32,7 +32,7 @@ class IterateMean:
         """Takes an iterate into account.
 
         Args:
-            iterate: Floating-point tensors by name; names and shapes stay the same until :meth:`take`.
+            iterate: Floating-point tensors by name; names and shapes stay the same until :meth:`begin_anew`.
         """
         if not self._share:
             return
@@ -43,10 +43,14 @@ class IterateMean:
             mean.lerp_(iterate[name].detach(), weight)
         self._count += 1
 
-    def take(self) -> dict[str, torch.Tensor]:
-        """The means by name, none where there were no iterates; begins anew."""
-        means, self._means, self._count = self._means, {}, 0
-        return means
+    @property
+    def means(self) -> dict[str, torch.Tensor]:
+        """The means by name; none where there were no iterates."""
+        return dict(self._means)
+
+    def begin_anew(self) -> None:
+        """Forgets all iterates."""
+        self._means, self._count = {}, 0
 
     def state(self, iterate: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
         """All that the next means depend on, by name.

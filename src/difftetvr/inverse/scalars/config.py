@@ -130,6 +130,7 @@ class ScalarConfig(Schedule):
         return FitConfig(
             cells=self.cells,
             start="grid",
+            averaging=0.0,
             move=self.move,
             refine=self.refine,
             iterations=steps,

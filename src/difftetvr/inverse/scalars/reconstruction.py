@@ -20,7 +20,6 @@ from difftetvr.fitting.records.history import History
 from difftetvr.fitting.records.unread import Unread
 from difftetvr.fitting.refinement import Refinement
 from difftetvr.fitting.refinement.adaptive_run import AdaptiveRun
-from difftetvr.fitting.refinement.iterate_mean import IterateMean
 from difftetvr.fitting.refinement.pixels import Judgement
 from difftetvr.inverse.scalars.config import ScalarConfig
 from difftetvr.inverse.scalars.scalars import Scalars
@@ -94,7 +93,6 @@ class ScalarReconstruction(AdaptiveRun):
         self.scalars = Scalars(scalars.to(device), config.betas)
         self.iteration, self.history = 0, History()
         self._unread = Unread()
-        self._mean = IterateMean(config.averaging or 0.0)
 
     @property
     def function(self) -> TransferFunction:
@@ -122,7 +120,6 @@ class ScalarReconstruction(AdaptiveRun):
             self.knots.step(config.function_rate * config.rate_at(self.iteration))
         self._move(motion)
         self._unread.read_moves(self.history)
-        self._mean.add(self._iterate_now())
         self.iteration += 1
 
     def evaluate(self, views: list[int]) -> Evaluation:
@@ -245,7 +242,6 @@ class ScalarReconstruction(AdaptiveRun):
     def _refine_if_due(self) -> None:
         if self.strategy is None or not self.strategy.is_due(self._moment()):
             return
-        self._even_out()
         mesh, views = self.mesh, self._judged_views
         chosen = self.config.refinement_views_at(self.iteration, views, len(self._train_views))
         judgement = Judgement.of(
@@ -262,9 +258,6 @@ class ScalarReconstruction(AdaptiveRun):
 
         situation, judges = self._situation(self.scalars.values, model, reach=_REACH), judgement.some()
         self._refine_by(self.strategy, situation, lambda: judges.error(self.mesh, self.field()))
-
-    def _learned(self) -> dict[str, torch.Tensor]:
-        return {"scalar": self.scalars.values}
 
     def _apply(self, refinement: Refinement) -> None:
         for change in refinement.changes:

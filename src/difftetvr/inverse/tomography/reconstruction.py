@@ -18,7 +18,6 @@ from difftetvr.fitting.records.history import History
 from difftetvr.fitting.records.unread import Unread
 from difftetvr.fitting.refinement import Refinement, Strategy
 from difftetvr.fitting.refinement.adaptive_run import AdaptiveRun
-from difftetvr.fitting.refinement.iterate_mean import IterateMean
 from difftetvr.inverse.tomography.alignment import Alignment
 from difftetvr.inverse.tomography.config import TomographyConfig
 from difftetvr.inverse.tomography.densities import Densities
@@ -80,7 +79,6 @@ class Reconstruction(AdaptiveRun):
         self.budget = max(config.budget, self._mesh.num_cells if mesh is not None else 0)
         self.iteration, self.history = 0, History()
         self._unread = Unread()
-        self._mean = IterateMean(config.averaging or 0.0)
         self._description = _describe(capture)
 
     def step(self) -> None:
@@ -99,7 +97,6 @@ class Reconstruction(AdaptiveRun):
         self._move(rate)
         self._keep_free()  # also what has moved there
         self._unread.read_moves(self.history)
-        self._mean.add(self._iterate_now())
         self.iteration += 1
 
     def solve(self, on_step: Callable[[int], None] | None = None) -> None:
@@ -231,7 +228,6 @@ class Reconstruction(AdaptiveRun):
     def _refine_if_due(self) -> None:
         if self.strategy is None or not self.strategy.is_due(self._moment()):
             return
-        self._even_out()
         mesh, densities = self.mesh, self.densities
         most = self._judged_pixels * self.measurements.all_pixels
         parts = self._pixels_to_judge(self._judged_views, round(min(Judgement.wanted(mesh), most)))
@@ -242,9 +238,6 @@ class Reconstruction(AdaptiveRun):
 
         situation, judges = self._situation(densities.values, model, self._outside), judgement.some()
         self._refine_by(self.strategy, situation, lambda: judges.error(self.mesh, densities.detached()))
-
-    def _learned(self) -> dict[str, torch.Tensor]:
-        return {"density": self.densities.values}
 
     def _keep_free(self) -> None:
         if self._outside is not None:
