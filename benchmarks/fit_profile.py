@@ -2,8 +2,8 @@
 
 The Tooth from its views, with the options of a fit; some cycles of iterations and a refinement are done first, so that
 kernels are there and the mesh is as irregular as in a run. Times are exclusive: what a part calls counts there. A cycle
-after those that are timed is watched by the profilers of Dr.Jit and PyTorch, for the shares of kernels and of PyTorch's
-operations in it; what is neither is Python, with what watching costs.
+after those that are timed is watched by the profilers of Dr.Jit and PyTorch; what neither accounts for of the time of
+the others, which nobody watched, is Python's.
 
     python benchmarks/fit_profile.py [--cells 20000 303000 1000000] [--sizes 128 512] [--cycles 2]
 """
@@ -108,13 +108,15 @@ class Profile:
         watch: Seconds of parts, of all cycles.
         iterations: Iterations of a cycle.
         cells: Cells of the mesh.
-        layers: Shares of one more cycle by what works.
+        kernels: Seconds of one more cycle in Dr.Jit's kernels.
+        pytorch: Seconds of it in PyTorch's operations.
     """
 
     watch: Stopwatch
     iterations: float
     cells: int
-    layers: dict[str, float]
+    kernels: float
+    pytorch: float
 
 
 def profile(capture: dtv.Capture, cells: int, cycles: int) -> Profile:
@@ -138,23 +140,21 @@ def profile(capture: dtv.Capture, cells: int, cycles: int) -> Profile:
         watch.reset()
         iterations = run(cycles)
         watch._pass("")
-    return Profile(watch, iterations / cycles, trainer.mesh.num_cells, shares_of_layers(lambda: run(1)))
+    return Profile(watch, iterations / cycles, trainer.mesh.num_cells, *seconds_by_layer(lambda: run(1)))
 
 
-def shares_of_layers(work: Callable[[], Any]) -> dict[str, float]:
-    """Shares of the time in Dr.Jit's kernels, in PyTorch's operations, and of the rest."""
+def seconds_by_layer(work: Callable[[], Any]) -> tuple[float, float]:
+    """Seconds in Dr.Jit's kernels, and in PyTorch's operations."""
     dr.kernel_history_clear()
-    began = time.perf_counter()
     with (
         dr.scoped_set_flag(dr.JitFlag.KernelHistory, True),
         torch.profiler.profile(activities=[ProfilerActivity.CPU]) as log,
     ):
         work()
-        whole = time.perf_counter() - began
     kernels = sum(entry["execution_time"] for entry in dr.kernel_history()) / 1e3
     # Functions of one's own have events, too, in which kernels run.
-    pytorch = sum(event.self_cpu_time_total for event in log.key_averages() if event.key.startswith("aten::")) / 1e6
-    return {"kernels": kernels / whole, "PyTorch": pytorch / whole, "Python": 1.0 - (kernels + pytorch) / whole}
+    pytorch = sum(event.self_cpu_time_total for event in log.key_averages() if event.key.startswith("aten::"))
+    return kernels, pytorch / 1e6
 
 
 def table_of(profile: Profile, size: int, cycles: int) -> Table:
@@ -170,8 +170,9 @@ def table_of(profile: Profile, size: int, cycles: int) -> Table:
         each = f"{1e3 * spent / calls:.2f}" if calls else ""
         table.add_row(name, f"{calls:g}", f"{spent:.2f}", each, f"{spent / whole:.0%}")
     table.add_row("all", "", f"{whole:.2f}", "", "100%", end_section=True)
-    for name, share in profile.layers.items():
-        table.add_row(name, "", "", "", f"{share:.0%}")
+    layers = {"kernels": profile.kernels, "PyTorch": profile.pytorch}
+    for name, spent in (layers | {"Python": whole - sum(layers.values())}).items():
+        table.add_row(name, "", f"{spent:.2f}", "", f"{spent / whole:.0%}")
     return table
 
 

@@ -346,3 +346,12 @@ def test_capture_without_held_out_views(small_capture):
     metrics = fit(everything, FitConfig(cells=500, iterations=2, evaluate_every=1, device="cpu")).metrics
     assert metrics["psnr"] is None
     assert metrics["train_psnr"] > 5
+
+
+def test_glances_tell_the_psnr_alone(small_capture, monkeypatch):
+    trainer = Trainer(small_capture, SMALL)
+    whole = trainer.evaluate(trainer._glanced_views())
+    assert len(whole.ssim) == len(whole.psnr) > 0
+    monkeypatch.setattr("difftetvr.fitting.records.evaluation.ssim", lambda *_: pytest.fail("SSIM is of no use here"))
+    trainer.glance()
+    assert trainer.history.evaluations == [(0, whole.mean_psnr)]

@@ -147,18 +147,20 @@ class Trainer(AdaptiveRun):
         if self.iteration == self.config.steps:
             self._keep_free()
 
-    def evaluate(self, views: list[int]) -> Evaluation:
+    def evaluate(self, views: list[int], similarity: bool = True) -> Evaluation:
         """Image quality of the reconstruction as it is now; each view is rendered by one of the processes.
 
         Args:
             views: Indices of the views to compare.
+            similarity: Whether SSIM is wanted, too.
         """
         mesh, field, background = self.mesh, self.field(), self.config.evaluation_background()
-        own = [compared(mesh, field, self._truth, [view], background).row for view in self.processes.share(views)]
+        shared = self.processes.share(views)
+        own = [compared(mesh, field, self._truth, [view], background, similarity).row for view in shared]
         return Evaluation.of_rows(self.processes.gathered(own, len(views), 3))
 
     def _mean_psnr(self, views: list[int]) -> float | None:
-        return self.evaluate(views).mean_psnr
+        return self.evaluate(views, similarity=False).mean_psnr
 
     def field(self) -> Field:
         """Colours and densities as they are now, detached."""

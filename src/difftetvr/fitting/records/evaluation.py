@@ -24,8 +24,8 @@ class Evaluation:
     Attributes:
         views: Indices of the views in the capture.
         psnr: PSNR in dB of each.
-        ssim: SSIM of each, in which masked pixels are right; empty where the images are smaller than its window of
-            11 x 11 pixels.
+        ssim: SSIM of each, in which masked pixels are right; empty where it was not asked for, or the images are
+            smaller than its window of 11 x 11 pixels.
     """
 
     views: list[int]
@@ -113,15 +113,20 @@ def evaluate(
 
 
 def compared(
-    mesh: TetMesh, field: Field | ScalarField, truth: Truth, views: Sequence[int], background: Color = BLACK
+    mesh: TetMesh,
+    field: Field | ScalarField,
+    truth: Truth,
+    views: Sequence[int],
+    background: Color = BLACK,
+    similarity: bool = True,
 ) -> Evaluation:
-    """What :func:`evaluate` returns, of a capture whose views are known already."""
+    """What :func:`evaluate` returns, of a capture whose views are known already; SSIM, which costs most, if wanted."""
     psnrs, ssims = [], []
     views = [view for view in views if truth.share(view) > 0.0]
     for view in views:
         image, expected = seen_and_true(mesh, field, truth, view, background)
         psnrs.append(psnr(image, expected, truth.share(view)))
-        if min(expected.shape[:2]) >= SSIM_WINDOW:
+        if similarity and min(expected.shape[:2]) >= SSIM_WINDOW:
             ssims.append(ssim(image, expected))
     return Evaluation(views, psnrs, ssims)
 

@@ -131,7 +131,7 @@ class ScalarReconstruction(AdaptiveRun):
         return compared(self.mesh, self.field(), self._truth, views, BLACK)
 
     def _mean_psnr(self, views: list[int]) -> float | None:
-        return self.evaluate(views).mean_psnr
+        return compared(self.mesh, self.field(), self._truth, views, BLACK, similarity=False).mean_psnr
 
     def _seen_and_true(self, view: int) -> tuple[torch.Tensor, torch.Tensor]:
         return seen_and_true(self.mesh, self.field(), self._truth, view)
