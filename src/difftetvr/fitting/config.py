@@ -11,7 +11,7 @@ from difftetvr.declared import require_declared
 from difftetvr.errors import FitError
 from difftetvr.fitting.cameras.options import CameraRefinement
 from difftetvr.fitting.motion import Motion
-from difftetvr.fitting.options import LARGEST_COUNT, RunOptions, Schedule, require
+from difftetvr.fitting.options import LARGEST_COUNT, Schedule, require
 from difftetvr.fitting.refinement import Exchange, Grow, Star, Strategy
 from difftetvr.mesh.limits import CELLS_PER_CUBE, MAX_CELLS, MAX_DEGREE
 
@@ -234,13 +234,8 @@ class FitConfig(Schedule):
         left_open = {name: choices[name] for name in CHOSEN_FOR_CAPTURE if getattr(self, name) is None}
         return dataclasses.replace(self, **left_open)
 
-    def require_same_run(self, other: RunOptions) -> None:
-        """See `RunOptions.require_same_run`; runs of before there were means had none."""
-        mine, theirs = (
-            dataclasses.replace(run, averaging=run.averaged) if isinstance(run, FitConfig) else run
-            for run in (self, other)
-        )
-        Schedule.require_same_run(mine, theirs)
+    def _comparable(self) -> FitConfig:
+        return dataclasses.replace(self, averaging=self.averaged)
 
     def for_processes(self, count: int) -> FitConfig:
         """These options with so many views per step, if that was left open."""

@@ -92,13 +92,17 @@ class RunOptions:
         Raises:
             FitError: An option that decides the steps differs; names the first one.
         """
-        differing = _first_difference(self, other, self.free)
+        differing = _first_difference(self._comparable(), other._comparable(), self.free)
         if differing is not None:
             name, mine, theirs = differing
             raise FitError(
                 f"The saved run has {name} = {mine}, this run asks for {theirs}; resume with the same options or start "
                 "anew."
             )
+
+    def _comparable(self) -> RunOptions:
+        """The options as other runs' are compared with them: with values for those that older runs did not have."""
+        return self
 
     def to_json(self) -> dict[str, Any]:
         """The options as JSON values."""
