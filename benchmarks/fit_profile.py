@@ -157,20 +157,20 @@ def seconds_by_layer(work: Callable[[], Any]) -> tuple[float, float]:
     return kernels, pytorch / 1e6
 
 
-def table_of(profile: Profile, size: int, cycles: int) -> Table:
+def table_of(found: Profile, size: int, cycles: int) -> Table:
     """Parts by their share, and below them the layers."""
-    seconds = {name: total / cycles for name, total in profile.watch.seconds.most_common()}
+    seconds = {name: total / cycles for name, total in found.watch.seconds.most_common()}
     whole = sum(seconds.values())
-    title = f"{profile.cells} cells, {size} x {size} pixels, per cycle of {profile.iterations:g}"
+    title = f"{found.cells} cells, {size} x {size} pixels, per cycle of {found.iterations:g}"
     table = Table(title=title)
     for heading in ("part", "calls", "seconds", "ms a call", "share"):
         table.add_column(heading, justify="left" if heading == "part" else "right")
     for name, spent in seconds.items():
-        calls = profile.watch.calls[name] / cycles
+        calls = found.watch.calls[name] / cycles
         each = f"{1e3 * spent / calls:.2f}" if calls else ""
         table.add_row(name, f"{calls:g}", f"{spent:.2f}", each, f"{spent / whole:.0%}")
     table.add_row("all", "", f"{whole:.2f}", "", "100%", end_section=True)
-    layers = {"kernels": profile.kernels, "PyTorch": profile.pytorch}
+    layers = {"kernels": found.kernels, "PyTorch": found.pytorch}
     for name, spent in (layers | {"Python": whole - sum(layers.values())}).items():
         table.add_row(name, "", f"{spent:.2f}", "", f"{spent / whole:.0%}")
     return table

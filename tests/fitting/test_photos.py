@@ -12,7 +12,7 @@ from difftetvr.capture.orbit import fibonacci_orbit
 from difftetvr.fitting.losses import l1, l1_ssim, sparsity
 from difftetvr.fitting.metrics import ssim
 from difftetvr.fitting.records.checkpoint import Checkpoint
-from difftetvr.fitting.refinement import Exchange
+from difftetvr.fitting.refinement import Exchange, Refinement
 from difftetvr.fitting.trainer import Trainer
 from difftetvr.mesh.harmonics import COUNTS
 
@@ -90,7 +90,7 @@ def room(shiny: dtv.Capture) -> dtv.Capture:
 
 
 @pytest.mark.parametrize("start", ["grid", "points"])
-def test_nothing_is_put_before_the_cameras(room: dtv.Capture, start: str) -> None:
+def test_nothing_is_put_before_the_cameras(room: dtv.Capture, start: str, monkeypatch: pytest.MonkeyPatch) -> None:
     points = torch.nn.functional.normalize(torch.randn(200, 3, generator=torch.Generator().manual_seed(2)), dim=1)
     capture = dataclasses.replace(room, points=0.9 * points)
     exchange = Exchange(rounds=6, views=3, until=0.5)
@@ -99,13 +99,16 @@ def test_nothing_is_put_before_the_cameras(room: dtv.Capture, start: str) -> Non
     assert config.for_capture(capture).free_space == 0.8 and config.for_capture(room).free_space == 0.5
     assert config.for_capture(dataclasses.replace(capture, surroundings=1.0)).free_space == 0.0
     trainer = Trainer(capture, config)
-    space = capture.free_space(0.8)
+    space, apply, refined = capture.free_space(0.8), Trainer._apply, []
+
+    def applied(self: Trainer, refinement: Refinement) -> None:
+        apply(self, refinement)
+        refined.append(torch.equal(space.vertices_of(self.mesh), self.parameters.is_free))
+
+    monkeypatch.setattr(Trainer, "_apply", applied)
     for _ in range(30):
-        due = trainer.strategy.is_due(trainer._moment())
         trainer.step()
-        if due:
-            is_free = trainer.parameters.is_free
-            assert (space.vertices_of(trainer.mesh) == is_free).float().mean() > 0.98  # one step later
+    assert refined == [True] * len(trainer.history.refinements)
     is_free = trainer.parameters.is_free
     assert int(is_free.sum()) > 30 and trainer.history.refinements
     assert (trainer.parameters.detached_field().density[is_free] == 0.0).all()

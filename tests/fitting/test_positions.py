@@ -302,6 +302,14 @@ def test_moves_to_places_as_far_as_the_mesh_allows(seed, boundary, dtype, length
         assert torch.equal(optimizer.state()[name], state[name])
 
 
+def test_takes_one_place_for_each_vertex():
+    optimizer = VertexOptimizer(jittered_grid())
+    before = optimizer.mesh
+    with pytest.raises(FitError, match=r"^The places have shape \(3,\); pass one for each vertex, \(48, 3\)\.$"):
+        optimizer.move_to(torch.zeros(3))
+    assert optimizer.mesh is before
+
+
 def test_says_what_is_missing():
     mesh = jittered_grid()
     optimizer = VertexOptimizer(mesh)

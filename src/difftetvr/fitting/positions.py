@@ -130,8 +130,14 @@ class VertexOptimizer:
 
         Args:
             places: (V, 3) where they shall be, such as the means of where they have been.
+
+        Raises:
+            FitError: There is not one place for each vertex; nothing has changed then.
         """
         old = self.mesh.vertices.detach()
+        if places.shape != old.shape:
+            shapes = tuple(places.shape), tuple(old.shape)
+            raise FitError(f"The places have shape {shapes[0]}; pass one for each vertex, {shapes[1]}.")
         self._guarded(self._boundary.apply(old, places.detach().double() - old.double()))
 
     def carry(self, change: MeshChange) -> None:

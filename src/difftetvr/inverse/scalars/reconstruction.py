@@ -122,16 +122,17 @@ class ScalarReconstruction(AdaptiveRun):
         self._unread.read_moves(self.history)
         self.iteration += 1
 
-    def evaluate(self, views: list[int]) -> Evaluation:
+    def evaluate(self, views: list[int], similarity: bool = True) -> Evaluation:
         """Image quality of the reconstruction as it is now, over black.
 
         Args:
             views: Indices of the views to compare.
+            similarity: Whether SSIM is wanted, too.
         """
-        return compared(self.mesh, self.field(), self._truth, views, BLACK)
+        return compared(self.mesh, self.field(), self._truth, views, BLACK, similarity)
 
     def _mean_psnr(self, views: list[int]) -> float | None:
-        return compared(self.mesh, self.field(), self._truth, views, BLACK, similarity=False).mean_psnr
+        return self.evaluate(views, similarity=False).mean_psnr
 
     def _seen_and_true(self, view: int) -> tuple[torch.Tensor, torch.Tensor]:
         return seen_and_true(self.mesh, self.field(), self._truth, view)
